@@ -1,0 +1,299 @@
+"""Every exchange between ranks, by name; the only module that calls mpi4py.
+
+`Parallel` holds a communicator: reductions, broadcasts, sparse messages, agreement on errors.
+`Halo` moves rows between the rank that owns a body and the ranks that hold a ghost of it.
+
+Symbols: P ranks; n owned rows; g ghost rows, stored behind the owned ones in rank order.
+"""
+
+from __future__ import annotations
+
+import sys
+import traceback
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+_EXCHANGE_TAGS = (71, 72)
+_HALO_TAG = 73
+_BLOCK_TAG = 74
+
+
+class Parallel:
+    """A group of ranks. Methods marked collective must be called by all of them, in one order."""
+
+    def __init__(self, communicator: MPI.Comm | None = None) -> None:
+        self.communicator = MPI.COMM_WORLD if communicator is None else communicator
+        self.rank: int = self.communicator.Get_rank()
+        self.size: int = self.communicator.Get_size()
+        self.bytes_sent = 0
+        self._round = 0
+
+    # ---- reductions ------------------------------------------------------------------------
+
+    def sum(self, value: Any) -> Any:
+        """Collective. The sum over ranks of a number or an array, in the same type."""
+        return self._reduce(value, MPI.SUM)
+
+    def max(self, value: Any) -> Any:
+        """Collective. The elementwise maximum over ranks of a number or an array."""
+        return self._reduce(value, MPI.MAX)
+
+    def min(self, value: Any) -> Any:
+        """Collective. The elementwise minimum over ranks of a number or an array."""
+        return self._reduce(value, MPI.MIN)
+
+    def any(self, flag: bool) -> bool:
+        """Collective. Whether the flag is set on at least one rank."""
+        return bool(self.max(int(flag)))
+
+    def sum_in_place(self, array: NDArray) -> None:
+        """Collective. Replace a contiguous array by its sum over ranks."""
+        if self.size > 1:
+            self.communicator.Allreduce(MPI.IN_PLACE, array, op=MPI.SUM)
+
+    def max_in_place(self, array: NDArray) -> None:
+        """Collective. Replace a contiguous array by its maximum over ranks."""
+        if self.size > 1:
+            self.communicator.Allreduce(MPI.IN_PLACE, array, op=MPI.MAX)
+
+    def exclusive_sum(self, count: int) -> int:
+        """Collective. The sum of `count` over the ranks below this one (64 bits)."""
+        mine = np.array([count], dtype=np.int64)
+        below = np.zeros(1, dtype=np.int64)
+        self.communicator.Exscan(mine, below, op=MPI.SUM)
+        return int(below[0]) if self.rank else 0
+
+    def _reduce(self, value: Any, operation: MPI.Op) -> Any:
+        if isinstance(value, np.ndarray):
+            result = np.ascontiguousarray(value).copy()
+            if self.size > 1:
+                self.communicator.Allreduce(MPI.IN_PLACE, result, op=operation)
+            return result
+        kind = type(value)
+        dtype = np.float64 if isinstance(value, (float, np.floating)) else np.int64
+        result = np.array([value], dtype=dtype)
+        if self.size > 1:
+            self.communicator.Allreduce(MPI.IN_PLACE, result, op=operation)
+        return kind(result[0])
+
+    # ---- values that all ranks need --------------------------------------------------------
+
+    def broadcast(self, value: Any, root: int = 0) -> Any:
+        """Collective. Rank `root`'s Python object on every rank."""
+        return self.communicator.bcast(value, root=root)
+
+    def allgather(self, array: NDArray) -> NDArray:
+        """Collective. Equal-shaped arrays of all ranks stacked: (P, *shape)."""
+        mine = np.ascontiguousarray(array)
+        result = np.empty((self.size, *mine.shape), dtype=mine.dtype)
+        self.communicator.Allgather(mine, result)
+        return result
+
+    def gather(self, value: Any, root: int = 0) -> list[Any] | None:
+        """Collective. Every rank's Python object on `root` in rank order, None elsewhere."""
+        return self.communicator.gather(value, root=root)
+
+    def barrier(self) -> None:
+        """Collective. Wait until every rank is here."""
+        self.communicator.Barrier()
+
+    # ---- blocks through one rank -----------------------------------------------------------
+
+    def blocks_on_root(self, array: NDArray) -> Iterator[NDArray]:
+        """Collective. On rank 0 yield each rank's block in rank order; elsewhere send and stop.
+
+        Rank 0 never holds more than its own block and one other, so that a file can be written
+        through it without the memory of the whole. All blocks share dtype and trailing shape.
+        """
+        mine = np.ascontiguousarray(array)
+        counts = self.communicator.gather(mine.shape[0], root=0)
+        if self.rank:
+            if mine.shape[0]:
+                self._send(mine, 0)
+            return
+        assert counts is not None
+        yield mine
+        for source in range(1, self.size):
+            block = np.empty((counts[source], *mine.shape[1:]), dtype=mine.dtype)
+            if counts[source]:
+                self.communicator.Recv(_as_bytes(block), source=source, tag=_BLOCK_TAG)
+            yield block
+
+    def _send(self, array: NDArray, destination: int) -> None:
+        self.communicator.Send(_as_bytes(array), dest=destination, tag=_BLOCK_TAG)
+        self.bytes_sent += array.nbytes
+
+    # ---- sparse messages -------------------------------------------------------------------
+
+    def exchange(self, messages: Mapping[int, bytes]) -> dict[int, bytes]:
+        """Collective. Deliver each message to its rank; return those received, by source.
+
+        The receivers are not known beforehand: synchronous sends, probing, and a barrier that a
+        rank enters once its own messages have been matched (T. Hoefler, C. Siebert,
+        A. Lumsdaine, PPoPP 2010). Cost grows with the neighbours, not with P.
+        """
+        received: dict[int, bytes] = {}
+        if self.rank in messages:
+            received[self.rank] = messages[self.rank]
+        others = {r: m for r, m in messages.items() if r != self.rank}
+        if self.size == 1:
+            return received
+        # Alternating tags: a rank can be one round ahead of another, never two.
+        tag = _EXCHANGE_TAGS[self._round % 2]
+        self._round += 1
+        requests = [self.communicator.Issend(m, dest=r, tag=tag) for r, m in others.items()]
+        self.bytes_sent += sum(len(m) for m in others.values())
+        barrier = None
+        while True:
+            status = MPI.Status()
+            found = self.communicator.Improbe(source=MPI.ANY_SOURCE, tag=tag, status=status)
+            if found is not None:
+                buffer = bytearray(status.Get_count(MPI.BYTE))
+                found.Recv(buffer)
+                received[status.Get_source()] = bytes(buffer)
+            elif barrier is None:
+                if MPI.Request.Testall(requests):
+                    barrier = self.communicator.Ibarrier()
+            elif barrier.Test():
+                break
+        return dict(sorted(received.items()))
+
+    # ---- errors ----------------------------------------------------------------------------
+
+    def raise_together(self, error: Exception | None) -> None:
+        """Collective. If any rank brings an error, raise the lowest rank's on all of them."""
+        first = self.min(self.size if error is None else self.rank)
+        if first < self.size:
+            raise self.broadcast(error, root=first)
+
+    def abort(self, exit_code: int) -> None:
+        """End all ranks now with this exit code."""
+        sys.stdout.flush()
+        sys.stderr.flush()
+        self.communicator.Abort(exit_code)
+
+    def install_abort_hook(self, exit_code: int = 70) -> None:
+        """Make an uncaught exception on one rank end all of them, with its message.
+
+        Without it the other ranks wait for ever in their next collective call.
+        """
+
+        def hook(kind: type[BaseException], value: BaseException, trace: Any) -> None:
+            where = f" on rank {self.rank} of {self.size}" if self.size > 1 else ""
+            text = "".join(traceback.format_exception(kind, value, trace))
+            sys.stderr.write(f"dem-mpi: internal error{where}: {value}\n{text}")
+            self.abort(getattr(value, "exit_code", exit_code))
+
+        sys.excepthook = hook
+
+
+def _as_bytes(array: NDArray) -> NDArray:
+    return array.reshape(-1).view(np.uint8)
+
+
+class Halo:
+    """Rows of owned bodies that other ranks hold as ghosts, and the way back.
+
+    Local arrays have owned + ghosts rows. Ghost rows are grouped by owner in rank order, within
+    an owner in its local order, so every sum over ghosts has one fixed order.
+    """
+
+    def __init__(
+        self,
+        parallel: Parallel,
+        owned: int,
+        send_index: Mapping[int, NDArray],
+        receive_count: Mapping[int, int],
+    ) -> None:
+        """Take the rows to send, by rank, and the number of ghosts to receive, by rank."""
+        self.parallel = parallel
+        self.owned = owned
+        self._send = [(r, np.ascontiguousarray(send_index[r])) for r in sorted(send_index)]
+        self._receive: list[tuple[int, slice]] = []
+        start = owned
+        for source in sorted(receive_count):
+            stop = start + receive_count[source]
+            self._receive.append((source, slice(start, stop)))
+            start = stop
+        self.ghosts = start - owned
+        self._buffers: dict[tuple, tuple[list[NDArray], list[NDArray]]] = {}
+
+    @classmethod
+    def build(cls, parallel: Parallel, owned: int, send_index: Mapping[int, NDArray]) -> Halo:
+        """Collective. Tell every receiver how many rows it gets. `send_index[r]` ascends."""
+        send = {r: np.asarray(i, dtype=np.int64) for r, i in send_index.items() if len(i)}
+        counts = parallel.exchange({r: np.int64(len(index)).tobytes() for r, index in send.items()})
+        receive = {r: int(np.frombuffer(m, dtype=np.int64)[0]) for r, m in counts.items()}
+        return cls(parallel, owned, send, receive)
+
+    def keep(self, needed: NDArray) -> Halo:
+        """Collective. The halo of those ghosts alone that `needed` (g,) bool marks on receivers.
+
+        Ghost rows keep their relative order: row k of the new halo is the k-th marked one.
+        """
+        marks = {
+            source: needed[rows.start - self.owned : rows.stop - self.owned]
+            for source, rows in self._receive
+        }
+        wanted = self.parallel.exchange(
+            {r: np.ascontiguousarray(mark, dtype=np.uint8).tobytes() for r, mark in marks.items()}
+        )
+        send = {}
+        for destination, index in self._send:
+            mask = np.frombuffer(wanted[destination], dtype=np.uint8).astype(bool)
+            if mask.any():
+                send[destination] = index[mask]
+        receive = {r: int(np.count_nonzero(mark)) for r, mark in marks.items() if mark.any()}
+        return Halo(self.parallel, self.owned, send, receive)
+
+    def forward(self, values: NDArray) -> None:
+        """Collective among neighbours. Overwrite ghost rows of (n + g, k) by their owners' rows."""
+        if not self._send and not self._receive:
+            return
+        outgoing, _ = self._buffers_for(values)
+        communicator = self.parallel.communicator
+        requests = [
+            communicator.Irecv(values[rows], source=source, tag=_HALO_TAG)
+            for source, rows in self._receive
+        ]
+        for (destination, index), buffer in zip(self._send, outgoing, strict=True):
+            np.take(values, index, axis=0, out=buffer)
+            requests.append(communicator.Isend(buffer, dest=destination, tag=_HALO_TAG))
+            self.parallel.bytes_sent += buffer.nbytes
+        MPI.Request.Waitall(requests)
+
+    def reverse_add(self, values: NDArray) -> None:
+        """Collective among neighbours. Add ghost rows of (n + g, k) to their owners' rows.
+
+        Contributions are added in rank order, so that the sum is the same every time. Ghost rows
+        are left as they are (stale).
+        """
+        if not self._send and not self._receive:
+            return
+        _, incoming = self._buffers_for(values)
+        communicator = self.parallel.communicator
+        requests = [
+            communicator.Irecv(buffer, source=destination, tag=_HALO_TAG)
+            for (destination, _), buffer in zip(self._send, incoming, strict=True)
+        ]
+        for source, rows in self._receive:
+            requests.append(communicator.Isend(values[rows], dest=source, tag=_HALO_TAG))
+            self.parallel.bytes_sent += values[rows].nbytes
+        MPI.Request.Waitall(requests)
+        for (_, index), buffer in zip(self._send, incoming, strict=True):
+            values[index] += buffer
+
+    def _buffers_for(self, values: NDArray) -> tuple[list[NDArray], list[NDArray]]:
+        width = 1 if values.ndim == 1 else values.shape[1]
+        key = (width, values.ndim, values.dtype.str)
+        if key not in self._buffers:
+            shapes = [(len(index), *values.shape[1:]) for _, index in self._send]
+            self._buffers[key] = (
+                [np.empty(s, dtype=values.dtype) for s in shapes],
+                [np.empty(s, dtype=values.dtype) for s in shapes],
+            )
+        return self._buffers[key]
