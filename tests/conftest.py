@@ -1,0 +1,54 @@
+"""Fixtures and options of the whole suite; `support/mpi_pytest.py` runs tests on several ranks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from mpi_pytest import Dispatcher, RankReporter
+
+if TYPE_CHECKING:
+    from dem_mpi.parallel import Parallel
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--long", action="store_true", help="also run tests marked `long`")
+
+
+def _on_rank(config: pytest.Config) -> RankReporter | None:
+    """The reporter where this pytest is one rank of an mpirun, None in the user's own."""
+    plugins = config.pluginmanager.get_plugins()
+    return next((plugin for plugin in plugins if isinstance(plugin, RankReporter)), None)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if _on_rank(config) is None:
+        config.pluginmanager.register(Dispatcher(config))
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--long"):
+        return
+    left_out = [item for item in items if item.get_closest_marker("long")]
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if not item.get_closest_marker("long")]
+
+
+@pytest.fixture(scope="session")
+def parallel() -> Parallel:
+    """All ranks of this run: one in a serial test, `rank_count` in a test marked `mpi`."""
+    from dem_mpi.parallel import Parallel
+
+    return Parallel()
+
+
+@pytest.fixture
+def shared_path(request: pytest.FixtureRequest) -> Path:
+    """An empty directory that all ranks of the test share (`tmp_path` differs on each rank)."""
+    on_rank = _on_rank(request.config)
+    if on_rank is None:
+        return request.getfixturevalue("tmp_path")
+    return on_rank.shared_path(request.node.nodeid)
