@@ -1,0 +1,232 @@
+"""One readable message for what is wrong with a scene: place, key, value, rule, remedy."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+from pydantic import ValidationError
+
+from dem_mpi.errors import InputError
+from dem_mpi.yaml_reader import Document, KeyPath, describe, join, shorten, show
+
+Schema = dict[str, Any]
+
+_BOUNDS = {
+    "greater_than": ("gt", "must be > {}"),
+    "greater_than_equal": ("ge", "must be >= {}"),
+    "less_than": ("lt", "must be < {}"),
+    "less_than_equal": ("le", "must be <= {}"),
+    "too_short": ("min_length", "must have at least {} item(s)"),
+    "too_long": ("max_length", "must have at most {} item(s)"),
+    "string_too_short": ("min_length", "must have at least {} character(s)"),
+    "string_too_long": ("max_length", "must have at most {} characters"),
+}
+_KINDS = {
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "dict_type": "a mapping",
+    "model_type": "a mapping",
+    "model_attributes_type": "a mapping",
+}
+
+
+def message(document: Document, path: KeyPath, rule: str) -> str:
+    """`file:line: key.path = value: rule`."""
+    try:
+        value = document.value(path)
+    except LookupError:
+        return f"{document.place(path)}: {join(path)}: {rule}"
+    bulky = isinstance(value, (dict, list)) and len(show(value)) > 50
+    if not path or bulky:
+        return f"{document.place(path)}: {join(path) or 'scene'}: {rule}"
+    return f"{document.place(path)}: {join(path)} = {show(value)}: {rule}"
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """A remedy for a misspelt word: the nearest known one, or the list of them."""
+    known = list(known)
+    close = difflib.get_close_matches(word[:64].lower(), known, n=1)
+    if close:
+        return f". Did you mean '{close[0]}'?"
+    return f"; known here: {', '.join(known)}" if known else ""
+
+
+def explain(error: ValidationError, document: Document, schema: Schema) -> InputError:
+    """The one error to tell: misspelt keys first, missing keys last, otherwise by position.
+
+    A misspelt required key makes two findings; the misspelling is the one to name.
+    """
+    order = {"extra_forbidden": 0, "missing": 2}
+    first = min(
+        error.errors(include_url=False, include_context=True),
+        key=lambda finding: order.get(finding["type"], 1),
+    )
+    path = _without_tags(first["loc"])
+    if first["type"] == "missing" and isinstance(path[-1], int):
+        path = path[:-1]
+    if first["type"] == "union_tag_invalid":
+        path = (*path, "shape")
+    return InputError(message(document, path, _rule(first, path, document, schema)))
+
+
+def _without_tags(location: tuple[str | int, ...]) -> KeyPath:
+    """Pydantic's location without the names of union members and the marks of dict keys."""
+    if location[:1] == ("walls",) and len(location) > 2:
+        location = location[:2] + location[3:]
+    unions = ("<number>", "<list>", "<uniform>")
+    return tuple(key for key in location if key not in unions and key != "[key]")
+
+
+def _rule(finding: Any, path: KeyPath, document: Document, schema: Schema) -> str:
+    kind, context, value = finding["type"], finding.get("ctx", {}), finding["input"]
+    if kind == "extra_forbidden":
+        return "unknown key" + _suggest(path, document, schema)
+    if kind == "missing":
+        if isinstance(finding["loc"][-1], int):
+            return f"must be a list of more than {finding['loc'][-1]} items"
+        return f"this key is required{_unit(path, document, schema)}"
+    if kind in _BOUNDS:
+        key, text = _BOUNDS[kind]
+        return text.format(f"{context[key]:g}") + _unit(path, document, schema)
+    if kind == "int_type" and isinstance(value, float):
+        return "must be a whole number" + (f"; write {value:.0f}" if value.is_integer() else "")
+    if kind in _KINDS:
+        return f"must be {_KINDS[kind]}, not {describe(value)}" + _hint(kind, value)
+    if kind == "finite_number":
+        return "must be a finite number"
+    if kind in ("int_from_float", "int_parsing_size"):
+        return "must be a whole number"
+    if kind == "literal_error":
+        return _one_of(value, context["expected"].replace(" or ", ", "))
+    if kind == "union_tag_invalid":
+        return _one_of(value["shape"], context["expected_tags"])
+    if kind == "union_tag_not_found":
+        return "shape is required: plane or box"
+    if kind == "string_pattern_mismatch":
+        return _pattern_rule(path)
+    if kind == "value_error":
+        return str(context.get("error", finding["msg"]))
+    return shorten(finding["msg"], 200)
+
+
+def _one_of(value: Any, choices_text: str) -> str:
+    choices = [choice.strip("' ") for choice in choices_text.split(",")]
+    close = difflib.get_close_matches(str(value)[:64].lower(), choices, n=1)
+    remedy = f". Did you mean '{close[0]}'?" if close else ""
+    return f"must be {'one of ' * (len(choices) > 1)}{', '.join(choices)}{remedy}"
+
+
+def _pattern_rule(path: KeyPath) -> str:
+    if path[:1] == ("output",):
+        return "must be a plain file name ending in .h5; --out names the directory"
+    return "a name starts with a letter and has letters, digits, _ and - only"
+
+
+def _hint(kind: str, value: Any) -> str:
+    """Why something that looks like a number is none."""
+    if kind not in ("float_type", "int_type") or not isinstance(value, str):
+        return ""
+    for text, advice in (
+        (value, "without quotes"),
+        (value.replace(",", "."), "with a decimal point"),
+        (value.replace("_", ""), "without _"),
+    ):
+        try:
+            number = float(text)
+        except ValueError:
+            continue
+        return f"; write {number:g} {advice}"
+    return ""
+
+
+def _unit(path: KeyPath, document: Document, schema: Schema) -> str:
+    """The unit of the key, or of the list that the path's last item stands in."""
+    while path and isinstance(path[-1], int):
+        path = path[:-1]
+    if not path:
+        return ""
+    for node in _sections(path[:-1], document, schema):
+        unit = node.get("properties", {}).get(path[-1], {}).get("unit")
+        if unit and unit != "1":
+            return f" [{unit}]"
+    return ""
+
+
+def _suggest(path: KeyPath, document: Document, schema: Schema) -> str:
+    """The nearest valid key of this section, else the section where the key does belong."""
+    word = str(path[-1])
+    known = [
+        key for node in _sections(path[:-1], document, schema) for key in node.get("properties", {})
+    ]
+    if not difflib.get_close_matches(word.lower(), known, n=1):
+        homes = [
+            name for name, node in schema["$defs"].items() if word in node.get("properties", {})
+        ]
+        if word in schema["properties"]:
+            return f"; '{word}' is a key of the scene itself, not of {join(path[:-1])}"
+        if homes:
+            return f"; '{word}' is a key of {_home(homes[0])}"
+    return nearest(word, known)
+
+
+def _home(model: str) -> str:
+    """Where a model stands in a scene."""
+    return {
+        "Material": "materials.<name>",
+        "BodyGroup": "bodies[i]",
+        "JitteredGrid": "bodies[i].placement.jittered_grid",
+        "Placement": "bodies[i].placement",
+        "UniformRadius": "bodies[i].radius",
+        "PlaneWall": "walls[i]",
+        "BoxWall": "walls[i]",
+        "Motion": "walls[i].motion",
+        "Oscillation": "walls[i].motion.oscillation",
+        "FrictionPair": "friction.pairs[i]",
+        "Rest": "time.stop_at_rest",
+    }.get(model, model.lower())
+
+
+def _sections(path: KeyPath, document: Document, schema: Schema) -> list[Schema]:
+    """The parts of the JSON schema that may describe the section at `path`."""
+    nodes = _variants(schema, schema)
+    for depth, key in enumerate(path, start=1):
+        found: list[Schema] = []
+        for node in nodes:
+            if isinstance(key, int):
+                child = node.get("items")
+            else:
+                child = node.get("properties", {}).get(key, node.get("additionalProperties"))
+            if isinstance(child, dict):
+                found += _variants(child, schema)
+        nodes = _of_shape(found, document, path[:depth])
+    return nodes
+
+
+def _variants(node: Schema, schema: Schema) -> list[Schema]:
+    """A schema with references followed and alternatives spread out."""
+    if "$ref" in node:
+        return _variants(schema["$defs"][node["$ref"].rpartition("/")[2]], schema)
+    alternatives = [alternative for key in ("oneOf", "anyOf") for alternative in node.get(key, [])]
+    return [node] + [
+        variant
+        for alternative in alternatives
+        if "required" not in alternative
+        for variant in _variants(alternative, schema)
+    ]
+
+
+def _of_shape(nodes: list[Schema], document: Document, path: KeyPath) -> list[Schema]:
+    """Only the variants whose fixed `shape` is the one written, where one is."""
+    try:
+        section = document.value(path)
+    except LookupError:
+        return nodes
+    shape = section.get("shape") if isinstance(section, dict) else None
+    fitting = [n for n in nodes if n.get("properties", {}).get("shape", {}).get("const") == shape]
+    return fitting or nodes
