@@ -8,34 +8,46 @@ Symbols: P ranks; n owned rows; g ghost rows, stored behind the owned ones in ra
 
 from __future__ import annotations
 
+import pickle
 import sys
 import traceback
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
+
+from mpi4py import MPI
 
 _EXCHANGE_TAGS = (71, 72)
 _HALO_TAG = 73
 _BLOCK_TAG = 74
+_CHUNK = 1 << 30  # bytes in one MPI call, whose counts are 32-bit
 
 
 class Parallel:
     """A group of ranks. Methods marked collective must be called by all of them, in one order."""
 
     def __init__(self, communicator: MPI.Comm | None = None) -> None:
-        self.communicator = MPI.COMM_WORLD if communicator is None else communicator
+        """Collective. Take a duplicate of `communicator` (default: all ranks of the job).
+
+        Messages of other code on the same ranks then cannot be mistaken for ours.
+        """
+        self.communicator = (MPI.COMM_WORLD if communicator is None else communicator).Dup()
         self.rank: int = self.communicator.Get_rank()
         self.size: int = self.communicator.Get_size()
         self.bytes_sent = 0
         self._round = 0
 
+    def free(self) -> None:
+        """Collective. Give the communicator back to MPI; nothing else works after that."""
+        self.communicator.Free()
+
     # ---- reductions ------------------------------------------------------------------------
+    # Integers and flags of any width are reduced in 64 bits, so that counts cannot overflow.
 
     def sum(self, value: Any) -> Any:
-        """Collective. The sum over ranks of a number or an array, in the same type."""
+        """Collective. The sum over ranks of a number or an array."""
         return self._reduce(value, MPI.SUM)
 
     def max(self, value: Any) -> Any:
@@ -68,17 +80,12 @@ class Parallel:
         return int(below[0]) if self.rank else 0
 
     def _reduce(self, value: Any, operation: MPI.Op) -> Any:
-        if isinstance(value, np.ndarray):
-            result = np.ascontiguousarray(value).copy()
-            if self.size > 1:
-                self.communicator.Allreduce(MPI.IN_PLACE, result, op=operation)
-            return result
-        kind = type(value)
-        dtype = np.float64 if isinstance(value, (float, np.floating)) else np.int64
-        result = np.array([value], dtype=dtype)
+        result = np.array(value, order="C")
+        if result.dtype.kind in "bi" or (result.dtype.kind == "u" and result.itemsize < 8):
+            result = result.astype(np.int64)
         if self.size > 1:
             self.communicator.Allreduce(MPI.IN_PLACE, result, op=operation)
-        return kind(result[0])
+        return result if isinstance(value, np.ndarray) else result.item()
 
     # ---- values that all ranks need --------------------------------------------------------
 
@@ -88,7 +95,7 @@ class Parallel:
 
     def allgather(self, array: NDArray) -> NDArray:
         """Collective. Equal-shaped arrays of all ranks stacked: (P, *shape)."""
-        mine = np.ascontiguousarray(array)
+        mine = np.asarray(array, order="C")
         result = np.empty((self.size, *mine.shape), dtype=mine.dtype)
         self.communicator.Allgather(mine, result)
         return result
@@ -106,26 +113,36 @@ class Parallel:
     def blocks_on_root(self, array: NDArray) -> Iterator[NDArray]:
         """Collective. On rank 0 yield each rank's block in rank order; elsewhere send and stop.
 
-        Rank 0 never holds more than its own block and one other, so that a file can be written
-        through it without the memory of the whole. All blocks share dtype and trailing shape.
+        Every rank must iterate. Rank 0 never holds more than its own block and one other, so
+        that a file can be written through it without the memory of the whole. All blocks share
+        dtype and trailing shape. If rank 0 stops early (a full disk), the rest is received and
+        dropped, so that the other ranks are not left waiting.
         """
         mine = np.ascontiguousarray(array)
         counts = self.communicator.gather(mine.shape[0], root=0)
-        if self.rank:
-            if mine.shape[0]:
-                self._send(mine, 0)
+        if counts is None:
+            self._send_block(mine)
             return
-        assert counts is not None
-        yield mine
-        for source in range(1, self.size):
-            block = np.empty((counts[source], *mine.shape[1:]), dtype=mine.dtype)
-            if counts[source]:
-                self.communicator.Recv(_as_bytes(block), source=source, tag=_BLOCK_TAG)
-            yield block
+        waiting = list(range(1, self.size))
+        try:
+            yield mine
+            while waiting:
+                source = waiting.pop(0)
+                yield self._receive_block(source, (counts[source], *mine.shape[1:]), mine.dtype)
+        finally:
+            for source in waiting:
+                self._receive_block(source, (counts[source], *mine.shape[1:]), mine.dtype)
 
-    def _send(self, array: NDArray, destination: int) -> None:
-        self.communicator.Send(_as_bytes(array), dest=destination, tag=_BLOCK_TAG)
+    def _send_block(self, array: NDArray) -> None:
+        for chunk in _chunks(_as_bytes(array)):
+            self.communicator.Send(chunk, dest=0, tag=_BLOCK_TAG)
         self.bytes_sent += array.nbytes
+
+    def _receive_block(self, source: int, shape: tuple[int, ...], dtype: np.dtype) -> NDArray:
+        block = np.empty(shape, dtype=dtype)
+        for chunk in _chunks(_as_bytes(block)):
+            self.communicator.Recv(chunk, source=source, tag=_BLOCK_TAG)
+        return block
 
     # ---- sparse messages -------------------------------------------------------------------
 
@@ -136,39 +153,58 @@ class Parallel:
         rank enters once its own messages have been matched (T. Hoefler, C. Siebert,
         A. Lumsdaine, PPoPP 2010). Cost grows with the neighbours, not with P.
         """
-        received: dict[int, bytes] = {}
-        if self.rank in messages:
-            received[self.rank] = messages[self.rank]
         others = {r: m for r, m in messages.items() if r != self.rank}
-        if self.size == 1:
-            return received
+        arrived: dict[int, list[bytes]] = {}
+        if self.rank in messages:
+            arrived[self.rank] = [bytes(messages[self.rank])]
+        if self.size > 1:
+            self._exchange_with_others(others, arrived)
+        return {source: b"".join(arrived[source]) for source in sorted(arrived)}
+
+    def _exchange_with_others(
+        self, messages: Mapping[int, bytes], arrived: dict[int, list[bytes]]
+    ) -> None:
         # Alternating tags: a rank can be one round ahead of another, never two.
         tag = _EXCHANGE_TAGS[self._round % 2]
         self._round += 1
-        requests = [self.communicator.Issend(m, dest=r, tag=tag) for r, m in others.items()]
-        self.bytes_sent += sum(len(m) for m in others.values())
+        # Chunks between two ranks arrive in the order in which they were sent.
+        requests = [
+            self.communicator.Issend(chunk, dest=destination, tag=tag)
+            for destination, message in messages.items()
+            for chunk in _chunks(memoryview(message)) or [b""]
+        ]
+        self.bytes_sent += sum(len(message) for message in messages.values())
+        status = MPI.Status()
         barrier = None
         while True:
-            status = MPI.Status()
             found = self.communicator.Improbe(source=MPI.ANY_SOURCE, tag=tag, status=status)
             if found is not None:
                 buffer = bytearray(status.Get_count(MPI.BYTE))
-                found.Recv(buffer)
-                received[status.Get_source()] = bytes(buffer)
+                found.Recv([buffer, MPI.BYTE])
+                arrived.setdefault(status.Get_source(), []).append(bytes(buffer))
             elif barrier is None:
                 if MPI.Request.Testall(requests):
                     barrier = self.communicator.Ibarrier()
             elif barrier.Test():
                 break
-        return dict(sorted(received.items()))
 
     # ---- errors ----------------------------------------------------------------------------
 
     def raise_together(self, error: Exception | None) -> None:
-        """Collective. If any rank brings an error, raise the lowest rank's on all of them."""
+        """Collective. If any rank brings an error, raise the lowest rank's on all of them.
+
+        That rank raises its own object, the others a copy of the same type and text; where the
+        type cannot be copied, a RuntimeError that names it. The exit code goes along.
+        """
         first = self.min(self.size if error is None else self.rank)
-        if first < self.size:
-            raise self.broadcast(error, root=first)
+        if first == self.size:
+            return
+        mine = error if self.rank == first else None
+        form = self.broadcast(None if mine is None else _portable_error(mine), root=first)
+        if mine is None:
+            mine = _error_from(form)
+            mine.add_note(f"raised on rank {first} of {self.size}")
+        raise mine
 
     def abort(self, exit_code: int) -> None:
         """End all ranks now with this exit code."""
@@ -193,6 +229,54 @@ class Parallel:
 
 def _as_bytes(array: NDArray) -> NDArray:
     return array.reshape(-1).view(np.uint8)
+
+
+def _chunks(data: Any) -> list[Any]:
+    """Consecutive views of a flat buffer of bytes, none longer than one MPI call can take."""
+    return [data[start : start + _CHUNK] for start in range(0, len(data), _CHUNK)]
+
+
+def _portable_error(error: Exception) -> bytes:
+    """Pickle a call that makes `error` again on another rank, tried out here.
+
+    Unpickling an exception calls its type with `args`, which fails where the constructor wants
+    something else; and its attributes may not be picklable. Then the type is made without its
+    constructor, and a local type becomes a RuntimeError that names it.
+    """
+    kind, text = type(error), str(error)
+    exit_code = getattr(error, "exit_code", None)
+    recipes = [
+        (_same, error),
+        (_error_without_constructor, kind, text, exit_code),
+        (_error_without_constructor, RuntimeError, f"{kind.__name__}: {text}", exit_code),
+    ]
+    for recipe in recipes[:-1]:
+        try:
+            form = pickle.dumps(recipe)
+            copy = _error_from(form)
+        except Exception:
+            continue
+        if type(copy) is kind and str(copy) == text:
+            return form
+    return pickle.dumps(recipes[-1])
+
+
+def _error_from(form: bytes) -> Exception:
+    make, *arguments = pickle.loads(form)
+    return make(*arguments)
+
+
+def _same(error: Exception) -> Exception:
+    return error
+
+
+def _error_without_constructor(
+    kind: type[Exception], text: str, exit_code: int | None
+) -> Exception:
+    error = kind.__new__(kind, text)
+    if exit_code is not None:
+        error.exit_code = exit_code
+    return error
 
 
 class Halo:
@@ -261,7 +345,8 @@ class Halo:
             for source, rows in self._receive
         ]
         for (destination, index), buffer in zip(self._send, outgoing, strict=True):
-            np.take(values, index, axis=0, out=buffer)
+            # Indices are valid by construction; "clip" spares the copy that "raise" makes.
+            np.take(values, index, axis=0, out=buffer, mode="clip")
             requests.append(communicator.Isend(buffer, dest=destination, tag=_HALO_TAG))
             self.parallel.bytes_sent += buffer.nbytes
         MPI.Request.Waitall(requests)
@@ -288,8 +373,7 @@ class Halo:
             values[index] += buffer
 
     def _buffers_for(self, values: NDArray) -> tuple[list[NDArray], list[NDArray]]:
-        width = 1 if values.ndim == 1 else values.shape[1]
-        key = (width, values.ndim, values.dtype.str)
+        key = (values.shape[1:], values.dtype.str)
         if key not in self._buffers:
             shapes = [(len(index), *values.shape[1:]) for _, index in self._send]
             self._buffers[key] = (
