@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from dem_mpi.scene_models import Scenario
+import numpy as np
+
+from dem_mpi.body_file import BodyFile
+from dem_mpi.placement import (
+    grid,
+    grid_capacity,
+    largest_radius,
+    smallest_radius,
+)
+from dem_mpi.scene_errors import nearest
+from dem_mpi.scene_models import BodyGroup, Scenario, wall_faces, wall_name
 from dem_mpi.yaml_reader import KeyPath
+
+# Steps are counted in float64 when times are computed from them.
+MAX_STEPS = 2**53
 
 
 class Finding(NamedTuple):
@@ -16,11 +31,233 @@ class Finding(NamedTuple):
     rule: str
 
 
+class Extent(NamedTuple):
+    """Corners (3,) [m] of the region that the surfaces of a group's bodies may reach."""
+
+    low: np.ndarray
+    high: np.ndarray
+
+
 def violations(scenario: Scenario) -> Iterator[Finding]:
-    """Every broken rule; the first is the one to tell."""
-    yield from ()
+    """The broken rules, in an order in which later ones may rely on earlier ones."""
+    yield from _steps(scenario)
+    yield from _names(scenario)
+    for index, group in enumerate(scenario.bodies):
+        if group.placement.file is None:
+            yield from _grid_room(index, group)
+        else:
+            yield from _file_form(index, group)
+    for index, depth, face, certain in _behind_walls(scenario, _extents(scenario)):
+        if certain:
+            rule = f"its bodies would reach {depth:.3g} m behind wall '{face}'"
+            yield Finding(("bodies", index, "placement", "jittered_grid"), rule)
 
 
 def doubts(scenario: Scenario) -> Iterator[Finding]:
-    """What is legal but physically doubtful."""
-    yield from ()
+    """What is legal but physically doubtful; the scene must have no violations."""
+    extents = _extents(scenario)
+    yield from _speed_doubts(scenario, extents)
+    yield from _place_doubts(scenario, extents)
+    frictions = [(("friction", "default"), scenario.friction.default)]
+    for index, pair in enumerate(scenario.friction.pairs):
+        frictions.append((("friction", "pairs", index, "mu"), pair.mu))
+    for path, mu in frictions:
+        if mu > 2:
+            yield Finding(path, "a friction coefficient above 2 is unusual")
+    if scenario.contact.recovery_speed is None:
+        rule = "without a bound, deep overlaps are pushed out at overlap / step and fly apart"
+        yield Finding(("contact", "recovery_speed"), rule)
+
+
+def _steps(scenario: Scenario) -> Iterator[Finding]:
+    step = scenario.time.step
+    if scenario.time.end / step > MAX_STEPS:
+        yield Finding(("time", "step"), f"makes more than 2^53 steps until {scenario.time.end:g} s")
+    for path, interval in (
+        (("time", "end"), scenario.time.end),
+        (("output", "interval"), scenario.output.interval),
+        (("checkpoint", "interval"), scenario.checkpoint.interval),
+    ):
+        if interval is None:
+            continue
+        ratio = interval / step
+        if ratio > MAX_STEPS:
+            yield Finding(path, "more than 2^53 steps")
+        if abs(ratio - round(ratio)) > 1e-6 + 1e-12 * ratio or round(ratio) < 1:
+            legal = [f"{n * step:.12g}" for n in (math.floor(ratio), math.floor(ratio) + 1) if n]
+            rule = f"must be a whole number of steps of {step:g} s; nearest: {' or '.join(legal)}"
+            yield Finding(path, rule)
+
+
+def _names(scenario: Scenario) -> Iterator[Finding]:
+    """Materials that are named but not defined; pairs and walls given twice."""
+    used: list[tuple[KeyPath, str]] = []
+    for i, pair in enumerate(scenario.friction.pairs):
+        used += [(("friction", "pairs", i, "between", j), pair.between[j]) for j in range(2)]
+    used += [(("bodies", i, "material"), body.material) for i, body in enumerate(scenario.bodies)]
+    used += [(("walls", i, "material"), wall.material) for i, wall in enumerate(scenario.walls)]
+    for path, name in used:
+        if name not in scenario.materials:
+            yield Finding(path, "unknown material" + nearest(name, scenario.materials))
+    pairs: dict[frozenset[str], int] = {}
+    for i, pair in enumerate(scenario.friction.pairs):
+        first = pairs.setdefault(frozenset(pair.between), i)
+        if first < i:
+            rule = f"this pair stands already in friction.pairs[{first}]"
+            yield Finding(("friction", "pairs", i, "between"), rule)
+    names: dict[str, int] = {}
+    for i, wall in enumerate(scenario.walls):
+        first = names.setdefault(wall_name(wall, i), i)
+        if first < i:
+            yield Finding(("walls", i, "name"), f"walls[{first}] has this name already")
+
+
+def _grid_room(index: int, group: BodyGroup) -> Iterator[Finding]:
+    """Whether the bodies of a group fit in its grid."""
+    region = group.placement.jittered_grid
+    assert region is not None
+    assert group.count is not None
+    here: KeyPath = ("bodies", index, "placement", "jittered_grid")
+    diameter = 2 * largest_radius(group)
+    size = " x ".join(f"{b - a:.6g}" for a, b in zip(region.min, region.max, strict=True))
+    if region.spacing is not None and region.spacing < diameter * (1 - 1e-12):
+        yield Finding((*here, "spacing"), f"must be at least the largest diameter, {diameter:g} m")
+        return
+    fit = grid_capacity(region, diameter)
+    if fit == 0:
+        yield Finding(here, f"{size} m is too thin for bodies of diameter {diameter:g} m")
+        return
+    spacing = ""
+    if region.spacing is not None:
+        spacing = f" with spacing {region.spacing:g} m"
+        fit = grid(region, group.count, diameter / 2).capacity
+    if fit < group.count:
+        yield Finding(
+            ("bodies", index, "count"),
+            f"bodies of diameter {diameter:g} m{spacing} do not all fit in the grid of {size} m; "
+            f"{fit} do. Lower count or enlarge placement.jittered_grid",
+        )
+
+
+def _file_form(index: int, group: BodyGroup) -> Iterator[Finding]:
+    """Whether a file of bodies is there and states what the scene does not."""
+    path = group.placement.path
+    if not path.is_file():
+        yield Finding(("bodies", index, "placement", "file"), f"no file {path}")
+        return
+    file = BodyFile(path, group.placement.dataset)
+    if file.rows == 0:
+        yield Finding(("bodies", index, "placement", "file"), "the file holds no bodies")
+    if group.count is not None and group.count > file.rows:
+        yield Finding(("bodies", index, "count"), f"{path} holds {file.rows} bodies only")
+    if group.radius is None and "radius" not in file.quantities:
+        yield Finding(("bodies", index), f"radius is required, because {path} states none")
+
+
+def _extents(scenario: Scenario) -> dict[int, Extent]:
+    """Where the bodies of each group start; without the groups read from files."""
+    extents = {}
+    for index, group in enumerate(scenario.bodies):
+        region = group.placement.jittered_grid
+        if region is not None and group.count is not None:
+            radius = largest_radius(group)
+            extents[index] = Extent(*grid(region, group.count, radius).bounds(group.count, radius))
+    return extents
+
+
+def _corners(extent: Extent) -> np.ndarray:
+    """The eight corners, (8, 3)."""
+    return np.array(list(itertools.product(*zip(*extent, strict=True))))
+
+
+def _behind_walls(
+    scenario: Scenario, extents: dict[int, Extent]
+) -> Iterator[tuple[int, float, str, bool]]:
+    """(group, depth [m], wall face, certain) where a group's region reaches behind a wall.
+
+    For an oblique wall a corner of the region may lie behind it with no body there.
+    """
+    faces = wall_faces(scenario)
+    for index, extent in extents.items():
+        tolerance = 1e-9 * _length(extent)
+        for k, name in enumerate(faces.name):
+            height = (_corners(extent) - faces.point[k]) @ faces.normal[k]
+            if height.min() < -tolerance:
+                straight = np.count_nonzero(faces.normal[k]) == 1
+                yield index, -float(height.min()), name, straight or height.max() < 0
+
+
+def _place_doubts(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Finding]:
+    for index, depth, face, certain in _behind_walls(scenario, extents):
+        if not certain:
+            rule = f"a corner of it lies {depth:.3g} m behind the oblique wall '{face}'"
+            yield Finding(("bodies", index, "placement", "jittered_grid"), rule)
+    domain = Extent(np.array(scenario.domain.min), np.array(scenario.domain.max))
+    for index, extent in extents.items():
+        if (extent.low > domain.high).any() or (extent.high < domain.low).any():
+            yield Finding(("bodies", index, "placement"), "these bodies start outside the domain")
+    yield from _shared_space(extents)
+
+
+def _shared_space(extents: dict[int, Extent]) -> Iterator[Finding]:
+    """Grids that reach into one another."""
+    groups = list(extents)
+    if len(groups) < 2:
+        return
+    low, high = (np.array([extent[side] for extent in extents.values()]) for side in range(2))
+    for i in range(len(groups) - 1):
+        overlap = np.minimum(high[i], high[i + 1 :]) - np.maximum(low[i], low[i + 1 :])
+        for j in np.flatnonzero((overlap > 1e-9 * (high[i] - low[i])).all(axis=1)):
+            rule = f"shares space with bodies[{groups[i]}]; bodies may overlap at the start"
+            yield Finding(("bodies", groups[i + 1 + int(j)], "placement"), rule)
+            return
+
+
+def _length(extent: Extent) -> float:
+    """The longest edge [m]."""
+    return float(np.max(extent.high - extent.low))
+
+
+def _speed_doubts(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Finding]:
+    """Bodies or walls that cross a radius within one step, so that contacts come too late."""
+    step = scenario.time.step
+    radii = [smallest_radius(group) for group in scenario.bodies if group.radius is not None]
+    for index, group in enumerate(scenario.bodies):
+        if group.radius is None:
+            continue
+        radius = smallest_radius(group)
+        speed = _speed_reached(scenario, group, extents.get(index))
+        if speed * step > radius:
+            rule = (
+                f"bodies[{index}] may reach {speed:.3g} m/s and cross its radius of {radius:g} m "
+                f"within a step; {radius / speed:.2g} s would resolve it"
+            )
+            yield Finding(("time", "step"), rule)
+    for index, wall in enumerate(scenario.walls):
+        if wall.motion is None or not radii:
+            continue
+        speed = math.hypot(*wall.motion.velocity)
+        if wall.motion.oscillation is not None:
+            swing = wall.motion.oscillation
+            speed += 2 * math.pi * swing.frequency * math.hypot(*swing.amplitude)
+        if speed * step > min(radii):
+            rule = f"moves up to {speed:.3g} m/s, more than a radius of {min(radii):g} m in a step"
+            yield Finding(("walls", index, "motion"), rule)
+
+
+def _speed_reached(scenario: Scenario, group: BodyGroup, extent: Extent | None) -> float:
+    """Upper estimate of a group's speed [m/s] after falling to the floor or to the end of time."""
+    speed = math.hypot(*group.velocity) + math.sqrt(3) * group.velocity_jitter
+    gravity = math.hypot(*scenario.gravity)
+    if gravity == 0:
+        return speed
+    down = np.array(scenario.gravity) / gravity
+    domain = Extent(np.array(scenario.domain.min), np.array(scenario.domain.max))
+    start = _corners(extent if extent is not None else domain)
+    heights = [float((_corners(domain) @ down).max() - (start @ down).min())]
+    faces = wall_faces(scenario)
+    for point, normal in zip(faces.point, faces.normal, strict=True):
+        if normal @ down < -0.1:
+            heights.append(float(((start - point) @ normal).max() / -(normal @ down)))
+    fall = max(0.0, min(heights))
+    return min(math.sqrt(speed**2 + 2 * gravity * fall), speed + gravity * scenario.time.end)

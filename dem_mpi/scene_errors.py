@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 from collections.abc import Iterable
 from typing import Any
 
@@ -50,11 +51,12 @@ def message(document: Document, path: KeyPath, rule: str) -> str:
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """A remedy for a misspelt word: the nearest known one, or the list of them."""
-    known = list(known)
-    close = difflib.get_close_matches(word[:64].lower(), known, n=1)
+    known = list(itertools.islice(known, 200))
+    close = difflib.get_close_matches(word[:64], known, n=1)
+    close = close or difflib.get_close_matches(word[:64].lower(), known, n=1)
     if close:
         return f". Did you mean '{close[0]}'?"
-    return f"; known here: {', '.join(known)}" if known else ""
+    return f"; known here: {shorten(', '.join(known), 200)}" if known else ""
 
 
 def explain(error: ValidationError, document: Document, schema: Schema) -> InputError:

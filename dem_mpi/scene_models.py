@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Discriminator,
@@ -26,7 +27,15 @@ from pydantic import (
     model_validator,
 )
 
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
+
+def _moderate(value: float) -> float:
+    """Refuse sizes whose squares and cubes would leave the range of float64."""
+    if value != 0 and not 1e-30 <= abs(value) <= 1e30:
+        raise ValueError("must be 0 or between 1e-30 and 1e30 in size")
+    return value
+
+
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False), AfterValidator(_moderate)]
 Whole = Annotated[int, Strict()]
 Switch = Annotated[bool, Strict()]
 Positive = Annotated[Number, Field(gt=0)]
@@ -194,7 +203,11 @@ class BodyGroup(Model):
     shape: Literal["sphere"] = note("Shape of the bodies", default="sphere")
     material: Name = note("Name of one of the materials")
     count: Whole | None = quantity(
-        "1", "Number of bodies; with placement.file all rows by default", default=None, ge=1
+        "1",
+        "Number of bodies; with placement.file all rows by default",
+        default=None,
+        ge=1,
+        le=2**48,
     )
     radius: Radius | None = quantity(
         "m",
