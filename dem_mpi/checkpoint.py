@@ -356,31 +356,47 @@ def _temporaries(directory: Path, stem: str) -> list[Path]:
     return [path for path in sorted(directory.iterdir()) if pattern.fullmatch(path.name)]
 
 
+def find_damage(path: Path | str) -> str:
+    """What is wrong with a checkpoint, '' for nothing; one process reads all of it."""
+    problem, sums = _partial_checksums(Path(path), rank=0, size=1)
+    return problem or _mismatch(sums, [local for local, _ in sums.values()])
+
+
 def _find_damage(parallel: Parallel, path: Path) -> str:
-    """Collective. What is wrong with a checkpoint, '' for nothing. Each rank reads its share."""
-    problem, names, local, expected = "", [], [], []
-    try:
-        with open_checked(path) as file:
-            _check_header(path, file)
-            names = list(_datasets(file))
-            if len(names) != file.attrs["datasets"]:
-                raise DataError(f"{path}: data sets are missing")
-            for name in names:
-                dataset = file[name]
-                start, stop = _share(parallel, dataset.shape[0])
-                expected.append(int(dataset.attrs["checksum"]))
-                local.append(_checksum_of(path, dataset, start, stop))
-    except DemError as error:
-        problem = str(error).removeprefix(f"{path}: ")
-    except HDF5_ERRORS as error:
-        problem = f"damaged: {reason(error)}"
+    """Collective. `find_damage`, each rank reading its share."""
+    problem, sums = _partial_checksums(path, parallel.rank, parallel.size)
     try:
         parallel.raise_together(DataError(problem) if problem else None)
     except DataError as error:
         return str(error)
-    total = parallel.sum(np.array(local, dtype=np.uint64))
-    wrong = [n for n, is_, want in zip(names, total.tolist(), expected, strict=True) if is_ != want]
-    return f"checksum of '{wrong[0]}' does not match" if wrong else ""
+    local = np.array([local for local, _ in sums.values()], dtype=np.uint64)
+    return _mismatch(sums, parallel.sum(local).tolist())
+
+
+def _partial_checksums(path: Path, rank: int, size: int) -> tuple[str, dict[str, tuple[int, int]]]:
+    """A fault, and by data set the checksum of one rank's rows and the one stored for all."""
+    sums: dict[str, tuple[int, int]] = {}
+    try:
+        with open_checked(path) as file:
+            _check_header(path, file)
+            for name in _datasets(file):
+                dataset = file[name]
+                rows = _share(rank, size, dataset.shape[0])
+                sums[name] = _checksum_of(path, dataset, *rows), int(dataset.attrs["checksum"])
+            if len(sums) != file.attrs["datasets"]:
+                raise DataError(f"{path}: data sets are missing")
+    except DemError as error:
+        return str(error).removeprefix(f"{path}: "), {}
+    except HDF5_ERRORS as error:
+        return f"damaged: {reason(error)}", {}
+    return "", sums
+
+
+def _mismatch(sums: Mapping[str, tuple[int, int]], total: list[int]) -> str:
+    for (name, (_, stored)), actual in zip(sums.items(), total, strict=True):
+        if actual != stored:
+            return f"checksum of '{name}' does not match"
+    return ""
 
 
 def _checksum_of(path: Path, dataset: h5py.Dataset, start: int, stop: int) -> int:
@@ -409,9 +425,9 @@ def _is_dataset(item: Any) -> bool:
     return isinstance(item, h5py.Dataset)
 
 
-def _share(parallel: Parallel, rows: int) -> tuple[int, int]:
-    """The rank's equal part [start, stop) of all rows."""
-    return rows * parallel.rank // parallel.size, rows * (parallel.rank + 1) // parallel.size
+def _share(rank: int, size: int, rows: int) -> tuple[int, int]:
+    """A rank's equal part [start, stop) of all rows."""
+    return rows * rank // size, rows * (rank + 1) // size
 
 
 # ---- reading -------------------------------------------------------------------------------
@@ -468,7 +484,7 @@ def _own_rows(parallel: Parallel, file: h5py.File, group: str, ranks: int) -> tu
     if parallel.size == ranks:
         start = int(rows[: parallel.rank].sum())
         return start, start + int(rows[parallel.rank])
-    return _share(parallel, int(rows.sum()))
+    return _share(parallel.rank, parallel.size, int(rows.sum()))
 
 
 def _read_rows(file: h5py.File, group: str, start: int, stop: int) -> dict[str, NDArray]:

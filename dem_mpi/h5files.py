@@ -101,19 +101,30 @@ def checksum(rows: NDArray, first_row: int = 0) -> int:
     total = 0
     for start in range(0, words.size, _BLOCK_WORDS):
         block = words[start : start + _BLOCK_WORDS].astype(np.uint64)
-        place = np.uint64((first_row * per_row + start) % 2**64)
-        index = np.arange(block.size, dtype=np.uint64)
-        index += place
-        index *= np.uint64(0x9E3779B97F4A7C15)
-        block ^= index
-        # The finaliser of MurmurHash3 (A. Appleby), a bijection of 64-bit words.
-        block ^= block >> np.uint64(33)
-        block *= np.uint64(0xFF51AFD7ED558CCD)
-        block ^= block >> np.uint64(33)
-        block *= np.uint64(0xC4CEB9FE1A85EC53)
-        block ^= block >> np.uint64(33)
-        total += int(block.sum(dtype=np.uint64))
+        place = np.arange(block.size, dtype=np.uint64)
+        place += np.uint64((first_row * per_row + start) % 2**64)
+        total += int(_hash(block, place).sum(dtype=np.uint64))
     return total % 2**64
+
+
+def row_checksums(rows: NDArray) -> NDArray:
+    """The checksum of each row by itself: (T, k) of 8-byte numbers to (T,) uint64."""
+    words = np.ascontiguousarray(rows).view(np.uint64)
+    place = np.broadcast_to(np.arange(words.shape[1], dtype=np.uint64), words.shape)
+    return _hash(words.copy(), place.copy()).sum(axis=1, dtype=np.uint64)
+
+
+def _hash(words: NDArray, place: NDArray) -> NDArray:
+    """Hash words in place; both arguments are overwritten."""
+    place *= np.uint64(0x9E3779B97F4A7C15)
+    words ^= place
+    # The finaliser of MurmurHash3 (A. Appleby), a bijection of 64-bit words.
+    words ^= words >> np.uint64(33)
+    words *= np.uint64(0xFF51AFD7ED558CCD)
+    words ^= words >> np.uint64(33)
+    words *= np.uint64(0xC4CEB9FE1A85EC53)
+    words ^= words >> np.uint64(33)
+    return words
 
 
 def _words(rows: NDArray) -> NDArray:
@@ -149,7 +160,7 @@ class SharedFile:
 
     With MPI-IO every rank holds the file; otherwise rank 0 alone does and `file` is None on the
     others. Changes of structure stand under `if shared.file is not None`, which is then the same
-    code for both; rows go through `write_rows`.
+    code for both; rows go through `write_rows`. `by_all` tells which of the two it is.
     """
 
     def __init__(
@@ -166,18 +177,18 @@ class SharedFile:
         self.path = Path(path)
         self.file: h5py.File | None = None
         alone = parallel.size == 1
-        self._by_all = not alone and not (
+        self.by_all = not alone and not (
             (not h5py.get_config().mpi) if through_root is None else through_root
         )
         # HDF5's own lock fails on some network file systems; `OutputLock` does its work.
         options: dict[str, Any] = {"libver": libver, "locking": False}
-        if self._by_all:
+        if self.by_all:
             options |= {"driver": "mpio", "comm": parallel.communicator}
         with agree(parallel, path, "open for writing"):
-            if self._by_all or parallel.rank == 0:
+            if self.by_all or parallel.rank == 0:
                 self.file = h5py.File(self.path, mode, **options)
         self._transfer = h5p.create(h5p.DATASET_XFER)
-        if self._by_all:
+        if self.by_all:
             self._transfer.set_dxpl_mpio(h5fd.MPIO_COLLECTIVE)
 
     def create_dataset(
@@ -227,7 +238,7 @@ class SharedFile:
         """
         rows = np.ascontiguousarray(rows)
         with agree(self.parallel, self.path, f"write '{name}'"):
-            if self._by_all:
+            if self.by_all:
                 self._write(name, start + self.parallel.exclusive_sum(rows.shape[0]), rows)
             else:
                 self._write_through_root(name, start, rows)
