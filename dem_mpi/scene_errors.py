@@ -203,7 +203,9 @@ def _sections(path: KeyPath, document: Document, schema: Schema) -> list[Schema]
             if isinstance(key, int):
                 child = node.get("items")
             else:
-                child = node.get("properties", {}).get(key, node.get("additionalProperties"))
+                # A mapping by name (materials) has one pattern that all its keys follow.
+                named = next(iter(node.get("patternProperties", {}).values()), None)
+                child = node.get("properties", {}).get(key, named)
             if isinstance(child, dict):
                 found += _variants(child, schema)
         nodes = _of_shape(found, document, path[:depth])
