@@ -145,23 +145,17 @@ def test_position_that_is_not_finite_is_refused_on_all_ranks(parallel, value):
 # ---- splitters -----------------------------------------------------------------------------
 
 
-def serial_owners(cloud: Bodies, weights: np.ndarray, size: int) -> np.ndarray:
+def serial_owners(parallel: Parallel, cloud: Bodies, weights: np.ndarray) -> np.ndarray:
     """The owner of each body by sorting them all: how many targets lie at or below the weight
     of the bodies before it, in Python's unbounded integers."""
-    origin, edge = bounding_cube(Parallel(_alone()), cloud.position)
+    origin, edge = bounding_cube(parallel, cloud.position)
     order = np.lexsort((cloud.gid, morton.encode(cloud.position, origin, edge)))
-    total = sum(map(int, weights))
+    size, total = parallel.size, sum(map(int, weights))
     owner, before = np.empty(len(cloud), int), 0
     for body in order:
         owner[body] = sum(before * size >= total * s for s in range(1, size))
         before += int(weights[body])
     return owner
-
-
-def _alone():
-    from mpi4py import MPI
-
-    return MPI.COMM_SELF
 
 
 WEIGHTS: dict[str, Callable[[int], np.ndarray]] = {
@@ -178,7 +172,7 @@ WEIGHTS: dict[str, Callable[[int], np.ndarray]] = {
 def test_splitters_equal_those_of_a_serial_sort(parallel, name, weighting):
     cloud = CLOUDS[name]()
     weights = WEIGHTS[weighting](len(cloud))
-    expected = serial_owners(cloud, weights, parallel.size)
+    expected = serial_owners(parallel, cloud, weights)
     partitions = []
     for distribution in DISTRIBUTIONS:
         rows = rows_of(parallel, len(cloud), distribution)
@@ -407,16 +401,16 @@ def test_halo_pruned_to_real_neighbours_holds_exactly_those(parallel):
 
 @pytest.mark.mpi(ranks=[2, 3, 8])
 def test_few_more_ghosts_are_sent_than_needed(parallel):
-    """A loose pack of 4000 spheres. The reach is a box, the need a ball: 6/π at the corners."""
+    """Where many bodies lie in reach, those that reach a region also reach a body in it."""
     cloud = cloud_of(np.random.default_rng(10).random((4000, 3)), 0.03)
     partition, bodies = distributed(parallel, cloud)
     owner = partition.owner(cloud.position, cloud.gid)
-    reach = 2.2 * cloud.radius
+    reach = np.full(len(cloud), 0.15)
     ghosts = ghost_gids(parallel, partition, bodies, reach[bodies.gid])
-    needed = needed_ghosts(cloud, owner, parallel.rank, reach, 2)
+    needed = needed_ghosts(cloud, owner, parallel.rank, reach, np.inf)
     surplus = parallel.sum(len(ghosts)) / parallel.sum(len(needed))
     print(f"ghosts sent over ghosts needed: {surplus:.3f}")
-    assert surplus < 2.0
+    assert surplus < 1.2
 
 
 @pytest.mark.mpi(ranks=[2, 3])
@@ -427,14 +421,15 @@ def test_body_on_the_wrong_rank_is_noticed(parallel):
         ghost_targets(parallel, partition, cloud.position, cloud.radius)
 
 
+class OneOfMany(Parallel):
+    """One rank played without the others, for what sends nothing."""
+
+    def __init__(self, rank: int, size: int) -> None:
+        self.rank, self.size = rank, size
+
+
 @pytest.mark.parametrize("rank", [0, 255, 511])
 def test_one_rank_of_512_finds_its_ghost_targets_alone(rank):
-    """Nothing is sent, so that one rank of many can be played without the others."""
-
-    class Rank(Parallel):
-        def __init__(self) -> None:
-            self.rank, self.size = rank, 512
-
     rng = np.random.default_rng(11)
     position = rng.random((20_000, 3))
     gid = np.arange(len(position))
@@ -445,8 +440,34 @@ def test_one_rank_of_512_finds_its_ghost_targets_alone(rank):
     owner = partition.owner(position, gid)
     mine = np.flatnonzero(owner == rank)
     reach = rng.uniform(0.0, 0.1, len(mine))
-    targets = ghost_targets(Rank(), partition, position[mine], reach)
+    targets = ghost_targets(OneOfMany(rank, 512), partition, position[mine], reach)
     near = np.abs(position[mine][:, None] - position[None]).max(axis=2) <= reach[:, None]
     for other in set(range(512)) - {rank}:
         needed = np.flatnonzero(near[:, owner == other].any(axis=1))
         assert set(needed.tolist()) <= set(targets.get(other, np.empty(0)).tolist())
+
+
+@pytest.mark.parametrize("rank", [0, 3, 6])
+def test_ghost_targets_are_the_ranks_whose_octree_cells_the_reach_meets(rank):
+    """Splitters on the borders of the 512 cells of level 3: regions are known cell by cell."""
+    cells, ranks = 512, 7
+    rng = np.random.default_rng(12)
+    first_cell = np.sort(rng.choice(np.arange(1, cells), ranks - 1, replace=False))
+    keys_of_a_cell = (morton.MAX_KEY + 1) // cells
+    partition = Partition(np.zeros(3), 1.0, first_cell * keys_of_a_cell, np.zeros(ranks - 1))
+    low = (morton.decode(np.arange(cells) * keys_of_a_cell) >> (morton.LEVELS - 3)) / 8.0
+    cell_owner = np.searchsorted(first_cell, np.arange(cells), side="right")
+
+    position = rng.uniform(-0.2, 1.2, (4000, 3))
+    position = position[partition.owner(position, np.arange(4000)) == rank]
+    reach = 10.0 ** rng.uniform(-3, 0, len(position))
+    # Cells at the faces of the cube stand for all that lies outside of it, too.
+    high = np.where(low == 7 / 8, np.inf, low + 1 / 8)
+    low = np.where(low == 0.0, -np.inf, low)
+    box_low, box_high = position - reach[:, None], position + reach[:, None]
+    meets = np.all((box_low[:, None] < high) & (box_high[:, None] >= low), axis=2)
+
+    targets = ghost_targets(OneOfMany(rank, ranks), partition, position, reach)
+    for other in set(range(ranks)) - {rank}:
+        expected = np.flatnonzero(meets[:, cell_owner == other].any(axis=1))
+        assert np.array_equal(targets.get(other, np.empty(0)), expected)
