@@ -132,16 +132,24 @@ def write(
         group: parallel.allgather(np.array([_row_count(columns)], dtype=np.int64))[:, 0]
         for group, columns in groups.items()
     }
+    size = _expected_size(groups, rows, shared)
     with agree(parallel, path, "write"):
         if parallel.rank == 0:
             path.parent.mkdir(parents=True, exist_ok=True)
             _remove_temporaries(path.parent, stem)
-            require_space(path, _expected_size(groups, rows, shared))
+            require_space(path, size)
     try:
-        file = SharedFile(parallel, temporary, "w", libver=_LIBVER, through_root=through_root)
+        file = SharedFile(
+            parallel,
+            temporary,
+            "w",
+            libver=_LIBVER,
+            through_root=through_root,
+            expected_size=size,
+        )
         try:
             sums = _create(file, step, groups, rows, shared, attributes, ragged)
-            file.sync(reserve=True)
+            file.flush()
             on_stage("created")
             _write_rows(file, groups, rows, shared)
             on_stage("data written")

@@ -171,8 +171,13 @@ class SharedFile:
         *,
         libver: tuple[str, str],
         through_root: bool | None = None,
+        expected_size: int = 0,
     ) -> None:
-        """Collective. `through_root` forces or forbids writing through rank 0; None asks h5py."""
+        """Collective. Open, or with mode "w" create; `expected_size` [B] of a new file is reserved.
+
+        `through_root` forces or forbids writing through rank 0; None asks h5py. Raises OutputError
+        on every rank if the file cannot be opened or the disk cannot hold it.
+        """
         self.parallel = parallel
         self.path = Path(path)
         self.file: h5py.File | None = None
@@ -180,16 +185,23 @@ class SharedFile:
         self.by_all = not alone and not (
             (not h5py.get_config().mpi) if through_root is None else through_root
         )
-        # HDF5's own lock fails on some network file systems; `OutputLock` does its work.
-        options: dict[str, Any] = {"libver": libver, "locking": False}
+        # HDF5's own lock fails on some network file systems; `OutputLock` does its work. Without
+        # the chunk cache an error belongs to the write that causes it, not to closing.
+        options: dict[str, Any] = {"libver": libver, "locking": False, "rdcc_nbytes": 0}
         if self.by_all:
             options |= {"driver": "mpio", "comm": parallel.communicator}
+        if expected_size:
+            with agree(parallel, path, "reserve space"):
+                if parallel.rank == 0:
+                    _reserve_blocks(self.path, expected_size)
         with agree(parallel, path, "open for writing"):
             if self.by_all or parallel.rank == 0:
                 self.file = h5py.File(self.path, mode, **options)
         self._transfer = h5p.create(h5p.DATASET_XFER)
         if self.by_all:
             self._transfer.set_dxpl_mpio(h5fd.MPIO_COLLECTIVE)
+        if expected_size:  # again: creating the file has emptied it
+            self.reserve(expected_size)
 
     def create_dataset(
         self,
@@ -286,17 +298,20 @@ class SharedFile:
             if self.file is not None:
                 h5f.flush(self.file.id)
 
-    def sync(self, *, reserve: bool = False) -> None:
-        """Collective. Flush to the disk itself; with `reserve`, first take the file's blocks.
+    def reserve(self, more: int = 0) -> None:
+        """Collective. Take the disk blocks of the whole file and of `more` bytes [B] behind it.
 
-        HDF5 allocates space in a file without the file system knowing; reserving it makes a full
-        disk show now, as an error, and not in the middle of a frame.
+        HDF5 allocates space in a file without the file system knowing. Reserving it beforehand
+        makes a full disk show as an error while nothing is half written; a rank that fails to
+        flush HDF5's own structures through MPI-IO would leave the others waiting.
         """
+        with agree(self.parallel, self.path, "reserve space"):
+            if self.parallel.rank == 0:
+                _reserve_blocks(self.path, self.path.stat().st_size + more)
+
+    def sync(self) -> None:
+        """Collective. Flush to the disk itself."""
         self.flush()
-        if reserve:
-            with agree(self.parallel, self.path, "reserve space"):
-                if self.parallel.rank == 0:
-                    _reserve_blocks(self.path)
         with agree(self.parallel, self.path, "write"):
             if self.file is not None:
                 fsync(self.path)
@@ -314,12 +329,12 @@ class SharedFile:
             self.close()
 
 
-def _reserve_blocks(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDWR)
+def _reserve_blocks(path: Path, size: int) -> None:
+    if not size:
+        return
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
     try:
-        status = os.fstat(descriptor)
-        if status.st_size > status.st_blocks * 512:
-            os.posix_fallocate(descriptor, 0, status.st_size)
+        os.posix_fallocate(descriptor, 0, size)
     except OSError as error:
         if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):
             raise

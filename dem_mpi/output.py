@@ -56,7 +56,8 @@ FORMAT_VERSION = 1
 _LIBVER = ("v108", "v110")
 _EXTENT_FRAMES = 16
 _EXTENT_BYTES = 1 << 30
-_INDEX_CHUNK = 256
+_INDEX_CHUNK = 256  # frames
+_STRUCTURE_BYTES = 1 << 17  # about what the structures of a new file and of an extension take
 _SMALLEST_CHUNK, _LARGEST_CHUNK = 1 << 10, 1 << 16  # rows
 _VERIFIED_ON_RESUME = _EXTENT_FRAMES
 
@@ -163,7 +164,8 @@ class Trajectory:
         self._cells = int(np.count_nonzero(index.count))
         self._largest = int(index.count.max(initial=0))
         self._failed = False
-        self._frame_capacity, self._row_capacity, self._connectivity_capacity = self._capacity()
+        # Frames, rows and connectivity that have room; how far the connectivity is written.
+        self._capacity, self._chunk_rows = _read_capacity(file)
         self._connected = 0
 
     @classmethod
@@ -208,7 +210,14 @@ class Trajectory:
             if parallel.rank == 0:
                 Path(path).parent.mkdir(parents=True, exist_ok=True)
                 require_space(path, _EXTENT_FRAMES * frame_bytes(fields, bodies))
-        file = SharedFile(parallel, path, "w", libver=_LIBVER, through_root=through_root)
+        file = SharedFile(
+            parallel,
+            path,
+            "w",
+            libver=_LIBVER,
+            through_root=through_root,
+            expected_size=_STRUCTURE_BYTES,
+        )
         _lay_out(file, fields, parallel.broadcast(dict(attributes)), _chunk_rows(bodies))
         file.sync()
         nothing = np.zeros(0, dtype=np.int64)
@@ -344,44 +353,43 @@ class Trajectory:
             self._file.write_rows("VTKHDF/Vertices/Connectivity", 0, ids)
             self._connected = total
 
-    def _capacity(self) -> tuple[int, int, int]:
-        file = self._file.file
-        sizes = (
-            None
-            if file is None
-            else tuple(
-                file[name].shape[0]
-                for name in ("frames/step", POSITION.place, "VTKHDF/Vertices/Connectivity")
-            )
-        )
-        return self._parallel.broadcast(sizes)
-
     def _make_room(self, count: int) -> None:
         """Extend the data sets by many frames when the next one, of `count` rows, has no room."""
-        grow_index = self.frames >= self._frame_capacity
-        grow_rows = self._rows + count > self._row_capacity
-        grow_connectivity = count > self._connectivity_capacity
-        if not (grow_index or grow_rows or grow_connectivity):
-            return
-        if grow_index:
-            self._frame_capacity = self.frames + _INDEX_CHUNK
-        if grow_rows:
+        old = self._capacity
+        frames, rows, connectivity = old
+        if self.frames >= frames:
+            frames = self.frames + _INDEX_CHUNK
+        if self._rows + count > rows:
             size = max(1, frame_bytes(self.fields, count))
-            frames = min(_EXTENT_FRAMES, max(1, _EXTENT_BYTES // size))
-            self._row_capacity = self._rows + frames * count
-        if grow_connectivity:
-            self._connectivity_capacity = count
+            rows = self._rows + count * min(_EXTENT_FRAMES, max(1, _EXTENT_BYTES // size))
+        connectivity = max(connectivity, count)
+        self._capacity = (frames, rows, connectivity)
+        if self._capacity == old:
+            return
+        self._file.reserve(self._growth(old, self._capacity))
         with agree(self._parallel, self.path, "extend"):
             if self._file.file is not None:
                 _set_extents(
                     self._file.file,
                     self.fields,
-                    frames=self._frame_capacity,
-                    rows=self._row_capacity,
-                    vertex_offsets=2 * self._frame_capacity,
-                    connectivity=self._connectivity_capacity,
+                    frames=frames,
+                    rows=rows,
+                    vertex_offsets=2 * frames,
+                    connectivity=connectivity,
                 )
-        self._file.sync(reserve=True)
+        self._file.sync()
+        self._file.reserve()
+
+    def _growth(self, old: tuple[int, int, int], new: tuple[int, int, int]) -> int:
+        """Bytes [B] that extending takes: whole chunks, and the structures that find them."""
+        per_frame = sum(8 * width for _, width in _index_datasets(self.fields).values()) + 16
+        chunks = [
+            -(-b // self._chunk_rows) - a // self._chunk_rows for a, b in zip(old, new, strict=True)
+        ]
+        size = (new[0] - old[0] + _INDEX_CHUNK) * per_frame
+        size += chunks[1] * self._chunk_rows * sum(f.row_bytes for f in self.fields)
+        size += chunks[2] * self._chunk_rows * 8
+        return size + size // 64 + _STRUCTURE_BYTES
 
     def sync(self) -> None:
         """Collective. Put all frames on the disk, as before a checkpoint that counts on them."""
@@ -445,6 +453,16 @@ def _released_on_error(lock: OutputLock) -> Iterator[None]:
     except BaseException:
         lock.release()
         raise
+
+
+def _read_capacity(shared: SharedFile) -> tuple[tuple[int, int, int], int]:
+    """Collective. Room for frames, rows and connectivity, and the rows of a chunk."""
+    sizes = None
+    if shared.file is not None:
+        names = ("frames/step", POSITION.place, "VTKHDF/Vertices/Connectivity")
+        capacity = tuple(shared.file[name].shape[0] for name in names)
+        sizes = (capacity, shared.file[POSITION.place].chunks[0])
+    return shared.parallel.broadcast(sizes)
 
 
 def _set_in_place(item: h5py.Group, name: str, value: int) -> None:
