@@ -8,8 +8,9 @@ angular_velocity (n, 3)]. A file that is damaged or that points out of itself ra
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn, TextIO
 
 import numpy as np
 
@@ -69,26 +70,34 @@ class BodyFile:
         return arrays
 
     def _csv_rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
-        width = len(self.columns)
         with self.path.open(encoding="utf-8") as file:
-            rows = filter(str.strip, file)
-            next(rows)
-            chosen = itertools.islice(rows, start, stop)
             try:
+                chosen = _csv_body_lines(file, start, stop)
                 table = np.loadtxt(chosen, delimiter=",", comments=None, ndmin=2)
-            except ValueError as error:
-                raise DataError(
-                    f"{self.path}: bodies {start} to {stop - 1} (from 0): {error}"
-                ) from None
-        if table.shape != (stop - start, width):
-            raise DataError(
-                f"{self.path}: {table.shape[1]} numbers a line where the header names {width}"
-            )
+            except ValueError:
+                table = np.empty((0, 0))
+        if table.shape != (stop - start, len(self.columns)):
+            self._refuse_first_bad_line(start, stop)
         order = {name: column for column, name in enumerate(self.columns)}
         arrays = {q: table[:, [order[name] for name in COLUMNS[q]]] for q in self.quantities}
         if "radius" in arrays:
             arrays["radius"] = arrays["radius"][:, 0]
         return arrays
+
+    def _refuse_first_bad_line(self, start: int, stop: int) -> NoReturn:
+        width = len(self.columns)
+        with self.path.open(encoding="utf-8") as file:
+            for row, line in enumerate(_csv_body_lines(file, start, stop), start=start):
+                try:
+                    bad = len([float(word) for word in line.split(",")]) != width
+                except ValueError:
+                    bad = True
+                if bad:
+                    raise DataError(
+                        f"{self.path}: body {row} (from 0): {line.strip()[:60]!r} is not "
+                        f"{width} numbers"
+                    )
+        raise DataError(f"{self.path}: holds fewer bodies than when it was opened")
 
     def _hdf5_rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
         import h5py
@@ -99,6 +108,12 @@ class BodyFile:
                 return {q: group[q][start:stop].astype(np.float64) for q in self.quantities}
         except (OSError, KeyError, RuntimeError) as error:
             raise DataError(f"{self.path}: cannot be read: {_short(error)}") from None
+
+
+def _csv_body_lines(file: TextIO, start: int, stop: int) -> Iterator[str]:
+    """Lines of the bodies start <= row < stop; blank lines count for nothing."""
+    lines = filter(str.strip, file)
+    return itertools.islice(lines, 1 + start, 1 + stop)
 
 
 def _short(error: Exception) -> str:

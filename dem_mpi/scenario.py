@@ -146,10 +146,13 @@ def effective(scenario: Scenario) -> dict[str, Any]:
     return data
 
 
-def restore_scenario(data: dict[str, Any]) -> Scenario:
-    """The scenario that `effective` came from. Raises InputError if it is not one."""
+def restore_scenario(data: dict[str, Any], directory: str | Path = ".") -> Scenario:
+    """The scenario that `effective` came from; files of bodies are relative to `directory`.
+
+    Raises InputError if `data` is no scene.
+    """
     try:
-        return Scenario.model_validate(data)
+        return Scenario.model_validate(data, context={"directory": Path(directory)})
     except ValidationError as error:
         raise InputError(f"stored scene: {error.errors()[0]['msg']}") from None
 

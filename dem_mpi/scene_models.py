@@ -300,7 +300,16 @@ class Contact(Model):
 
     solver: Literal["apgd"] = note("Method for the cone complementarity problem", default="apgd")
     tolerance: Positive = quantity(
-        "m/s (absolute), else 1", "Largest residual; times h, the overlap a step adds", default=1e-4
+        "m/s",
+        "Largest residual, which times h is the overlap a step adds; a pure number for the other "
+        "kinds than absolute",
+        default=1e-4,
+    )
+    complementarity: Positive = quantity(
+        "1",
+        "Largest |impulse . velocity| of a contact at which a solve may stop, as a fraction of"
+        " v_ref gamma_ref; unused by tolerance_kind thesis",
+        default=1e-4,
     )
     tolerance_kind: Literal["absolute", "scaled", "thesis"] = note(
         "absolute: dual residual in m/s; scaled: divided by the step's reference speed; "

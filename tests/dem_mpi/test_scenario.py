@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import pickle
 import random
 import time
 from pathlib import Path
@@ -11,8 +12,10 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+import yaml
 from scene_header import read_header
 
+from dem_mpi import yaml_reader
 from dem_mpi.errors import InputError
 from dem_mpi.scenario import (
     body_count,
@@ -98,6 +101,21 @@ def test_difference_names_the_changed_keys():
     lines = difference(old, new)
     assert "contact.tolerance: 0.001 -> 0.0001" in lines
     assert "time.stop_at_rest.max_speed: added 0.01" in lines
+
+
+def test_loaded_scene_travels_between_ranks():
+    loaded = parse_scenario(SCENE, "scene.yaml")
+    assert pickle.loads(pickle.dumps(loaded)) == loaded
+
+
+def test_reader_without_libyaml_reads_and_refuses_the_same(monkeypatch: pytest.MonkeyPatch):
+    fast = parse(SCENE, "s")
+    typo = refusal(text=SCENE.replace("tolerance", "tolerence"))
+    monkeypatch.setattr(yaml_reader, "_Loader", yaml.SafeLoader)
+    assert parse(SCENE, "s") == fast
+    assert refusal(text=SCENE.replace("tolerance", "tolerence")) == typo
+    assert "nested more than" in refusal(text="a: " + "[" * 5000)
+    assert "not valid YAML" in refusal(text="a: \x00")
 
 
 def test_scenario_is_frozen():
