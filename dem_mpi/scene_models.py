@@ -14,7 +14,6 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
-    AfterValidator,
     BaseModel,
     ConfigDict,
     Discriminator,
@@ -27,15 +26,7 @@ from pydantic import (
     model_validator,
 )
 
-
-def _moderate(value: float) -> float:
-    """Refuse sizes whose squares and cubes would leave the range of float64."""
-    if value != 0 and not 1e-30 <= abs(value) <= 1e30:
-        raise ValueError("must be 0 or between 1e-30 and 1e30 in size")
-    return value
-
-
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False), AfterValidator(_moderate)]
+Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
 Whole = Annotated[int, Strict()]
 Switch = Annotated[bool, Strict()]
 Positive = Annotated[Number, Field(gt=0)]
@@ -62,9 +53,18 @@ def note(text: str, **rules: Any) -> Any:
 
 
 class Model(BaseModel):
-    """Base of every part of a scene: immutable, no unknown keys."""
+    """Base of every part of a scene: immutable, no unknown keys, numbers of moderate size."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @field_validator("*")
+    @classmethod
+    def _moderate(cls, value: Any) -> Any:
+        """Refuse sizes whose squares and cubes would leave the range of float64."""
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, float) and number != 0 and not 1e-30 <= abs(number) <= 1e30:
+                raise ValueError("must be 0 or between 1e-30 and 1e30 in size")
+        return value
 
 
 class Region(Model):
