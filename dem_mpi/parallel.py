@@ -43,6 +43,11 @@ class Parallel:
         """Collective. Give the communicator back to MPI; nothing else works after that."""
         self.communicator.Free()
 
+    @classmethod
+    def alone(cls) -> Parallel:
+        """Return a group of this rank only."""
+        return cls(MPI.COMM_SELF)
+
     # ---- reductions ------------------------------------------------------------------------
     # Integers and flags of any width are reduced in 64 bits, so that counts cannot overflow.
 

@@ -1,0 +1,222 @@
+"""The command line: one verb a subcommand.
+
+Signals are heeded from the first lines on, before the heavy imports: a batch system's warning may
+come while the program starts.
+"""
+
+from __future__ import annotations
+
+from dem_mpi.signals import StopRequest
+
+STOP = StopRequest()
+if __name__ == "__main__":
+    STOP.install()
+
+import json  # noqa: E402
+import os  # noqa: E402
+import sys  # noqa: E402
+from pathlib import Path  # noqa: E402
+from typing import Annotated  # noqa: E402
+
+import typer  # noqa: E402
+
+from dem_mpi import __version__  # noqa: E402
+from dem_mpi.errors import DemError, InputError  # noqa: E402
+
+_EPILOG = (
+    "Exit codes: 0 done; 64 bad input; 65 bad data file; 70 internal error or solver failure; "
+    "74 input/output (disk full); 75 stopped by a signal with a checkpoint, run me again with "
+    "--resume. Signals: USR1 finishes the step, saves and exits with 75; so do TERM and INT where "
+    "they reach the ranks (scripts/run turns them into USR1; a bare mpirun ends its ranks on TERM "
+    "and INT at once, and the last periodic checkpoint stays valid)."
+)
+
+app = typer.Typer(
+    name="dem-mpi",
+    help="Rigid bodies in frictional contact on any number of MPI ranks.",
+    epilog=_EPILOG,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Scene = Annotated[Path, typer.Argument(help="Scene file (YAML).", metavar="SCENE")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY.PATH=VALUE",
+        help="Override a value of the scene, e.g. --set time.end=2 --set bodies.0.count=500. "
+        "May be repeated.",
+    ),
+]
+
+
+@app.callback(invoke_without_command=True)
+def _options(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    """Rigid bodies in frictional contact on any number of MPI ranks."""
+    if version:
+        _print(f"dem-mpi {__version__}")
+        raise typer.Exit
+
+
+@app.command("run", epilog=_EPILOG)
+def run_command(
+    scene: Scene,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Continue from the newest valid checkpoint, on any ranks."),
+    ] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="DIR", help="Output directory. [default: runs/<scene>]"),
+    ] = None,
+    overrides: Overrides = None,
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force",
+            help="Replace an existing trajectory; with --resume, accept a changed scene.",
+        ),
+    ] = False,
+) -> None:
+    """Simulate a scene: mpirun -n P dem-mpi run SCENE.
+
+    Writes the trajectory (run.h5 unless the scene says otherwise), checkpoints and metrics.jsonl
+    into the output directory.
+    """
+    from time import perf_counter
+
+    from dem_mpi.parallel import Parallel
+    from dem_mpi.runner import RunOptions, run
+    from dem_mpi.warmup import set_threads, warm_up
+
+    parallel = Parallel()
+    parallel.install_abort_hook()
+    loaded = _load_on_all(parallel, scene, overrides)
+    for warning in loaded.warnings:
+        _print(f"warning: {warning}", error=True)
+    set_threads(loaded.scenario.threads)
+    started = perf_counter()
+    warm_up(parallel, loaded.scenario.threads)
+    seconds = perf_counter() - started
+    if seconds > 2.0:
+        _print(f"compiled kernels in {seconds:.0f} s (first run only; kept in the numba cache)")
+    options = RunOptions(out or Path("runs") / scene.stem, resume, force)
+    run(parallel, loaded, options, STOP, _print)
+
+
+@app.command()
+def check(
+    scene: Scene,
+    overrides: Overrides = None,
+    ranks: Annotated[
+        int, typer.Option("--ranks", "-n", min=1, help="Ranks to estimate memory for.")
+    ] = 1,
+) -> None:
+    """Validate a scene and print what it would take; runs nothing."""
+    from dem_mpi.estimate import estimate
+    from dem_mpi.scenario import load_scenario
+
+    loaded = load_scenario(scene, overrides or ())
+    for warning in loaded.warnings:
+        _print(f"warning: {warning}", error=True)
+    for line in estimate(loaded.scenario, ranks).lines():
+        _print(line)
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of scene files, with units, for editors."""
+    from dem_mpi.scenario import json_schema
+
+    _print(json.dumps(json_schema(), indent=2))
+
+
+@app.command()
+def info(
+    file: Annotated[Path, typer.Argument(help="Trajectory or checkpoint.", metavar="FILE.h5")],
+) -> None:
+    """Say what is in a trajectory or checkpoint, and whether it is valid (65 if not)."""
+    from dem_mpi.output import describe
+
+    description = describe(file)
+    for line in description.lines():
+        _print(line)
+    raise typer.Exit(description.exit_code)
+
+
+@app.command()
+def warmup(
+    threads: Annotated[
+        int, typer.Option("--threads", min=1, help="Also compile the variants for threads.")
+    ] = 1,
+) -> None:
+    """Compile all kernels into the numba cache, so that no run has to."""
+    from time import perf_counter
+
+    from dem_mpi.parallel import Parallel
+    from dem_mpi.warmup import set_threads, warm_up
+
+    set_threads(threads)
+    started = perf_counter()
+    warm_up(Parallel(), threads)
+    _print(f"kernels ready in {perf_counter() - started:.1f} s")
+
+
+def _load_on_all(parallel, scene: Path, overrides: list[str] | None):
+    """Collective. Read the scene on rank 0; every rank gets it or the same error."""
+    from dem_mpi.scenario import load_scenario
+
+    loaded, error = None, None
+    if parallel.rank == 0:
+        try:
+            loaded = load_scenario(scene, overrides or ())
+        except DemError as caught:
+            error = caught
+    parallel.raise_together(error)
+    return parallel.broadcast(loaded)
+
+
+def _rank() -> int:
+    """Return the rank as the launcher tells it, without starting MPI."""
+    for name in ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "SLURM_PROCID"):
+        if os.environ.get(name, "").isdigit():
+            return int(os.environ[name])
+    return 0
+
+
+def _print(text: str, error: bool = False) -> None:
+    """Print a line once, not once a rank."""
+    if _rank() == 0:
+        print(text, file=sys.stderr if error else sys.stdout, flush=True)
+
+
+def main() -> None:
+    """Run the command line and exit with its code; errors are one message, printed once."""
+    STOP.install()
+    if _rank():
+        # Help and usage errors come before MPI knows which rank speaks.
+        sys.stdout = sys.stdout if _rank() == 0 else open(os.devnull, "w")  # noqa: SIM115
+    try:
+        code = app(standalone_mode=False)
+    except DemError as error:
+        _print(f"dem-mpi: error: {error}", error=True)
+        code = error.exit_code
+    except Exception as error:
+        if hasattr(error, "format_message"):  # a usage error of the command line
+            _print(f"dem-mpi: error: {error.format_message()}; see dem-mpi --help", error=True)
+            code = InputError.exit_code
+        else:
+            raise
+    sys.stdout.flush()
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,335 @@
+"""Contact detection: near pairs found rarely, contacts measured every step.
+
+A pair is a contact iff its gap is at most max(c min(r_a, r_b), h (|v_a - v_b| (1 + mu) +
+|w_a| r_a + |w_b| r_b)): bitwise the same on any number of ranks. Near pairs are listed with that
+margin and a skin, and the list stands until a body may have moved, or its margin grown, by half
+the skin.
+
+A contact joins a and b with gid(a) < gid(b) and belongs to the rank that owns a; walls are always
+b, with negative ids. The normal points from a to b; the gap is positive when they are apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dem_mpi import _kernels_detection as kernels
+from dem_mpi import _kernels_solver as frames
+from dem_mpi.bodies import Bodies, ImpulseMemory
+from dem_mpi.parallel import Halo, Parallel
+from dem_mpi.partition import Partition, ghost_targets
+
+
+@dataclass(frozen=True)
+class DetectionOptions:
+    """What decides which pairs are listed and which are contacts.
+
+    margin : c, in smaller radii; skin : [m]; friction : (materials, materials) table of mu
+    """
+
+    margin: float
+    skin: float
+    friction: NDArray
+    threads: int = 1
+
+    @property
+    def largest_friction(self) -> float:
+        """The largest mu of any pair of materials."""
+        return float(self.friction.max(initial=0.0))
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Planes at one instant; wall k has id -(k + 1) and is known to every rank.
+
+    point : (w, 3) [m]; normal : (w, 3) unit, to the side of the bodies; velocity : (w, 3) [m/s]
+    over the step; material : (w,) int32
+    """
+
+    point: NDArray
+    normal: NDArray
+    velocity: NDArray
+    material: NDArray
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The state of this rank's owned bodies from which near pairs were listed.
+
+    With it alone the list can be made again: a run that resumes starts from the stored reference
+    and has the list that the uninterrupted run has.
+
+    position : (n, 3) [m]; reach : (n,) [m] bound of the body's share of the margin
+    frame : (3,) [m/s] velocity subtracted in the bound
+    """
+
+    position: NDArray
+    reach: NDArray
+    frame: NDArray
+
+    @classmethod
+    def of(
+        cls,
+        parallel: Parallel,
+        bodies: Bodies,
+        predicted: NDArray,
+        options: DetectionOptions,
+        step: float,
+    ) -> Reference:
+        """Collective. The reference of the current state; `predicted` (n, 3) is v + h a."""
+        total = np.append(predicted.sum(axis=0), float(len(bodies)))
+        parallel.sum_in_place(total)
+        frame = total[:3] / max(total[3], 1.0)
+        reach = np.empty(len(bodies))
+        kernels.reach_speed(
+            predicted, bodies.angular_velocity, bodies.radius, frame,
+            options.largest_friction, step, reach,
+        )  # fmt: skip
+        return cls(bodies.position.copy(), reach, frame)
+
+    def drift(
+        self, bodies: Bodies, predicted: NDArray, options: DetectionOptions, step: float
+    ) -> float:
+        """Return the largest displacement plus growth of the margin of an owned body [m]."""
+        reach = np.empty(len(bodies))
+        kernels.reach_speed(
+            predicted, bodies.angular_velocity, bodies.radius, self.frame,
+            options.largest_friction, step, reach,
+        )  # fmt: skip
+        return float(kernels.largest_drift(bodies.position, self.position, reach, self.reach))
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Near pairs of owned bodies, and what does not change while the list stands.
+
+    Rows: n owned bodies, then the ghosts that some pair needs. gid, radius, material,
+    inverse_mass, inverse_inertia cover all rows. The pairs of body a are
+    neighbour[offset[a]:offset[a + 1]], in ascending gid.
+    """
+
+    reference: Reference
+    halo: Halo
+    gid: NDArray
+    radius: NDArray
+    material: NDArray
+    inverse_mass: NDArray
+    inverse_inertia: NDArray
+    offset: NDArray
+    neighbour: NDArray
+
+    @property
+    def pairs(self) -> int:
+        """Number of near pairs on this rank."""
+        return self.neighbour.shape[0]
+
+    def extend(self, owned: NDArray) -> NDArray:
+        """Collective. A copy of (n, k) rows with current ghost rows behind them."""
+        rows = np.empty((self.halo.owned + self.halo.ghosts, *owned.shape[1:]), owned.dtype)
+        rows[: self.halo.owned] = owned
+        self.halo.forward(rows)
+        return rows
+
+
+@dataclass(frozen=True)
+class ContactSet:
+    """The contacts this rank owns, ordered by (row of a, gid of b); walls first.
+
+    a, b       : (m,) int32 local rows; b = -(k + 1) is wall k
+    other      : (m,) int64 gid of b, or the wall's id
+    row        : (n + 1,) int64; contacts of owned body k are row[k]:row[k + 1]
+    normal     : (m, 3) from a to b;  gap : (m,) [m];  friction : (m,)
+    arm        : (m, 2) [m] from each centre to the common point in the middle of the gap
+    coincident : number of contacts whose centres coincide (their normal is e_z by convention)
+    """
+
+    a: NDArray
+    b: NDArray
+    other: NDArray
+    row: NDArray
+    normal: NDArray
+    gap: NDArray
+    arm: NDArray
+    friction: NDArray
+    coincident: int
+
+    @property
+    def count(self) -> int:
+        """Number of contacts on this rank."""
+        return self.a.shape[0]
+
+    @cached_property
+    def tangents(self) -> tuple[NDArray, NDArray]:
+        """Both tangents (m, 3) of each contact, pure functions of its normal."""
+        t1, t2 = np.empty_like(self.normal), np.empty_like(self.normal)
+        frames.tangents.serial(self.normal, t1, t2)
+        return t1, t2
+
+    def same_graph(self, other: ContactSet) -> bool:
+        """Whether the same bodies touch, so that matrix patterns can be kept."""
+        return np.array_equal(self.a, other.a) and np.array_equal(self.b, other.b)
+
+
+def find_neighbours(
+    parallel: Parallel,
+    partition: Partition,
+    bodies: Bodies,
+    reference: Reference,
+    options: DetectionOptions,
+) -> Neighbours:
+    """Collective. Make ghosts and list near pairs as the bodies stood at the reference.
+
+    Every body must be on the rank that owned its key at the reference. O(n) by a hashed grid with
+    one level for each doubling of the size.
+    """
+    owned = len(bodies)
+    # Two bodies are near iff their distance <= r + r + max(c min(r, r), reach + reach) + skin,
+    # which is at most the sum of these two effective radii.
+    effective = (
+        bodies.radius
+        + np.maximum(0.5 * options.margin * bodies.radius, reference.reach)
+        + 0.5 * options.skin
+    )
+    largest = parallel.max(float(effective.max(initial=0.0)))
+    targets = ghost_targets(parallel, partition, reference.position, effective + largest)
+    halo = Halo.build(parallel, owned, targets)
+
+    static = Neighbours(
+        reference=reference,
+        halo=halo,
+        gid=bodies.gid,
+        radius=bodies.radius,
+        material=bodies.material,
+        inverse_mass=1.0 / bodies.mass,
+        inverse_inertia=1.0 / bodies.inertia,
+        offset=np.zeros(owned + 1, dtype=np.int64),
+        neighbour=np.empty(0, dtype=np.int32),
+    )
+    gid, radius = static.extend(static.gid), static.extend(static.radius)
+    position, reach = static.extend(reference.position), static.extend(reference.reach)
+    effective = static.extend(effective)
+    low, high = _near_pairs(position, radius, reach, effective, gid, owned, options)
+
+    needed = np.zeros(halo.owned + halo.ghosts, dtype=bool)
+    needed[high] = True
+    needed[:owned] = True
+    pruned = halo.keep(needed[owned:])
+    renumber = (np.cumsum(needed) - 1).astype(np.int32)
+    gid = gid[needed]
+    offset = np.zeros(owned + 1, dtype=np.int64)
+    neighbour = np.empty(low.shape[0], dtype=np.int32)
+    kernels.group_pairs(low, renumber[high], gid, owned, offset, neighbour)
+    return Neighbours(
+        reference=reference,
+        halo=pruned,
+        gid=gid,
+        radius=radius[needed],
+        material=static.extend(static.material)[needed],
+        inverse_mass=static.extend(static.inverse_mass)[needed],
+        inverse_inertia=static.extend(static.inverse_inertia)[needed],
+        offset=offset,
+        neighbour=neighbour,
+    )
+
+
+def _near_pairs(
+    position: NDArray,
+    radius: NDArray,
+    reach: NDArray,
+    effective: NDArray,
+    gid: NDArray,
+    owned: int,
+    options: DetectionOptions,
+) -> tuple[NDArray, NDArray]:
+    """Return the rows (low, high) of all near pairs, the smaller gid first and owned."""
+    count = position.shape[0]
+    none = np.empty(0, dtype=np.int32)
+    if count == 0:
+        return none, none
+    smallest = float(effective.min())
+    level = np.empty(count, dtype=np.int64)
+    occupied = kernels.assign_levels(effective, smallest, level)
+    buckets = 1 << max(4, int(2 * count - 1).bit_length())
+    start = np.zeros(buckets + 1, dtype=np.int64)
+    entry = np.empty(count, dtype=np.int32)
+    entry_key = np.empty(count, dtype=np.int64)
+    kernels.fill_table(position, level, 2.0 * smallest, start, entry, entry_key)
+    search = kernels.search_pairs.using(options.threads)
+    offset = np.zeros(count + 1, dtype=np.int64)
+    grid = (level, occupied, 2.0 * smallest, start, entry, entry_key)
+    rule = (owned, options.margin, options.skin)
+    search(position, radius, reach, gid, *grid, *rule, offset, none, none)
+    np.cumsum(offset, out=offset)
+    low = np.empty(offset[-1], dtype=np.int32)
+    high = np.empty(offset[-1], dtype=np.int32)
+    if offset[-1]:
+        search(position, radius, reach, gid, *grid, *rule, offset, low, high)
+    return low, high
+
+
+def find_contacts(
+    neighbours: Neighbours,
+    position: NDArray,
+    predicted: NDArray,
+    angular_velocity: NDArray,
+    walls: Walls,
+    options: DetectionOptions,
+    step: float,
+) -> ContactSet:
+    """Measure the listed pairs and all walls, and keep those within the margin.
+
+    position, predicted, angular_velocity : (n + g, 3), ghosts current.
+    """
+    n, owned = neighbours, neighbours.halo.owned
+    row = np.zeros(owned + 1, dtype=np.int64)
+    motion = (position, n.radius, predicted, angular_velocity)
+    material = (n.material, options.friction)
+    pairs = (n.offset, n.neighbour)
+    wall = (walls.point, walls.normal, walls.velocity, walls.material)
+    rule = (step, options.margin)
+    kernels.count_contacts.using(options.threads)(*motion, *material, *pairs, *wall, *rule, row)
+    np.cumsum(row, out=row)
+    m = int(row[-1])
+    contacts = (
+        np.empty(m, dtype=np.int32),
+        np.empty(m, dtype=np.int32),
+        np.empty(m, dtype=np.int64),
+        np.empty((m, 3)),
+        np.empty(m),
+        np.empty((m, 2)),
+        np.empty(m),
+    )
+    coincident = np.zeros(owned, dtype=np.int32)
+    kernels.fill_contacts.using(options.threads)(
+        *motion, n.gid, *material, *pairs, *wall, *rule, row, *contacts, coincident
+    )
+    a, b, other, normal, gap, arm, friction = contacts
+    return ContactSet(a, b, other, row, normal, gap, arm, friction, int(coincident.sum()))
+
+
+def recall_impulses(
+    contacts: ContactSet, memory: ImpulseMemory, columns: int, scale: float, threads: int
+) -> NDArray:
+    """Return last step's impulses (m, columns) of the contacts that exist again, zero elsewhere.
+
+    World-frame impulses, times `scale`, in the new contact frames.
+    """
+    world = np.zeros((contacts.count, 3))
+    kernels.match_impulses.using(threads)(
+        contacts.row, contacts.other, memory.offsets, memory.other, memory.impulse, world
+    )
+    world *= scale
+    impulse = np.empty((contacts.count, columns))
+    frames.to_contact.using(threads)(contacts.normal, world, impulse)
+    return impulse
+
+
+def remember_impulses(contacts: ContactSet, impulse: NDArray, threads: int) -> ImpulseMemory:
+    """Keep impulses (m, columns) in the world frame, by the other body's gid."""
+    world = np.empty((contacts.count, 3))
+    frames.to_world.using(threads)(contacts.normal, impulse, world)
+    return ImpulseMemory(contacts.row, contacts.other, world)

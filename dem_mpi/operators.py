@@ -1,0 +1,197 @@
+"""D, M^-1 and N = D^T M^-1 D of a contact set: matrix-free, and assembled in PETSc.
+
+D_i maps the impulse (gamma_n, gamma_1, gamma_2) of contact i to generalised impulses, + on body b,
+- on body a. Rows of D^T are this rank's contacts; its columns are bodies, (v, w) each in a scene
+with friction and v alone without.
+
+Both forms compute the same product; the matrix-free one moves a tenth of the bytes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from petsc4py import PETSc
+
+from dem_mpi import _kernels_solver as kernels
+from dem_mpi.contacts import ContactSet
+from dem_mpi.parallel import Halo, Parallel
+
+
+class MatrixFree:
+    """N = D^T M^-1 D by loops over contacts and bodies.
+
+    Owned: contacts and the first `halo.owned` bodies. Ghost rows of the work arrays are current
+    after every `body_velocity`.
+
+    inverse_mass, inverse_inertia : (n + g,) [1/kg], [1/(kg m^2)]; ghosts current.
+    """
+
+    def __init__(
+        self,
+        contacts: ContactSet,
+        inverse_mass: NDArray,
+        inverse_inertia: NDArray,
+        halo: Halo,
+        frictional: bool,
+        threads: int = 1,
+    ) -> None:
+        self.contacts = contacts
+        self.halo = halo
+        self.columns = 3 if frictional else 1
+        bodies = inverse_mass.shape[0]
+        self._inverse_mass = inverse_mass
+        self._inverse_inertia = inverse_inertia
+        self._start = np.zeros(bodies + 1, dtype=np.int64)
+        self._second = np.empty(contacts.count, dtype=np.int32)
+        kernels.incidence(contacts.b, bodies, self._start, self._second)
+        self._world = np.empty((contacts.count, 3))
+        self._u = np.zeros((bodies, 6 if frictional else 3))
+        self._to_world = kernels.to_world.using(threads)
+        self._to_bodies = kernels.impulses_to_bodies.using(threads)
+        self._to_contacts = kernels.bodies_to_contacts.using(threads)
+        self._diagonal = kernels.diagonal.using(threads)
+
+    def body_velocity(self, impulse: NDArray) -> NDArray:
+        """Collective. u = M^-1 D impulse, (n + g, 6 or 3); a view that the next call overwrites."""
+        c = self.contacts
+        self._to_world(c.normal, impulse, self._world)
+        self._to_bodies(
+            c.normal, c.arm, self._world, c.row, self.halo.owned, self._start, self._second,
+            self._inverse_mass, self._inverse_inertia, self._u,
+        )  # fmt: skip
+        self.halo.reverse_add(self._u)
+        self.halo.forward(self._u)
+        return self._u
+
+    def contact_velocity(self, u: NDArray, out: NDArray) -> None:
+        """out = D^T u for body velocities u (n + g, 6 or 3) with current ghosts."""
+        c = self.contacts
+        self._to_contacts(c.normal, c.arm, c.a, c.b, u, out)
+
+    def apply(self, impulse: NDArray, out: NDArray) -> None:
+        """Collective. out = N impulse."""
+        self.contact_velocity(self.body_velocity(impulse), out)
+
+    def diagonal(self) -> NDArray:
+        """Return the diagonal of N, (m, columns) [1/kg]."""
+        c = self.contacts
+        diag = np.empty((c.count, self.columns))
+        self._diagonal(c.arm, c.a, c.b, self._inverse_mass, self._inverse_inertia, diag)
+        return diag
+
+    def destroy(self) -> None:
+        """Nothing to free: numpy owns all of it."""
+
+
+class Assembled:
+    """D^T and M^-1 as distributed PETSc matrices; N is applied as three products.
+
+    While the contact graph stands, `refill` keeps the pattern and overwrites the values.
+    """
+
+    def __init__(
+        self,
+        contacts: ContactSet,
+        inverse_mass: NDArray,
+        inverse_inertia: NDArray,
+        halo: Halo,
+        frictional: bool,
+        parallel: Parallel,
+    ) -> None:
+        self.contacts = contacts
+        self.columns = 3 if frictional else 1
+        self._dof = 6 if frictional else 3
+        self._halo = halo
+        self._parallel = parallel
+        owned = halo.owned
+        first = parallel.exclusive_sum(owned)
+        columns = np.zeros(inverse_mass.shape[0], dtype=np.int64)
+        columns[:owned] = first + np.arange(owned)
+        halo.forward(columns)
+        self._body_columns = (columns * self._dof).astype(PETSc.IntType)
+        comm = parallel.communicator
+        csr = self._rows(contacts)
+        sizes = ((contacts.count * self.columns, None), (owned * self._dof, None))
+        self.d_transposed = PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm)
+        self.inverse_mass = self._mass_matrix(inverse_mass, inverse_inertia, owned, first, comm)
+        self._diag = np.empty((contacts.count, self.columns))
+        kernels.diagonal.serial(
+            contacts.arm, contacts.a, contacts.b, inverse_mass, inverse_inertia, self._diag
+        )
+        self._gamma, self._g = self.d_transposed.createVecs(side="left"), None
+        self._g = self._gamma.duplicate()
+        self._w = self.d_transposed.createVecs(side="right")
+        self._u = self._w.duplicate()
+        self._local = np.zeros((inverse_mass.shape[0], self._dof))
+
+    def refill(self, contacts: ContactSet) -> bool:
+        """Collective. Take new geometry on the same contact graph; False if the graph changed."""
+        same = contacts.same_graph(self.contacts)
+        if not self._parallel.min(int(same)):
+            return False
+        self.contacts = contacts
+        indptr, indices, values = self._rows(contacts)
+        self.d_transposed.setValuesCSR(indptr, indices, values)
+        self.d_transposed.assemble()
+        return True
+
+    def _rows(self, contacts: ContactSet) -> tuple[NDArray, NDArray, NDArray]:
+        m, dof = contacts.count, self._dof
+        walls = int(np.count_nonzero(contacts.b < 0))
+        a_side = 3 + 2 * 6 if dof == 6 else 3
+        size = (2 * m - walls) * a_side
+        indptr = np.zeros(m * self.columns + 1, dtype=PETSc.IntType)
+        indices = np.empty(size, dtype=PETSc.IntType)
+        values = np.empty(size)
+        kernels.assembled_rows(
+            contacts.normal, contacts.arm, contacts.a, contacts.b, dof, self._body_columns,
+            indptr, indices, values,
+        )  # fmt: skip
+        return indptr, indices, values
+
+    def _mass_matrix(self, inverse_mass, inverse_inertia, owned, first, comm) -> PETSc.Mat:
+        dof = self._dof
+        entries = np.empty((owned, dof))
+        entries[:, :3] = inverse_mass[:owned, None]
+        if dof == 6:
+            entries[:, 3:] = inverse_inertia[:owned, None]
+        rows = owned * dof
+        indptr = np.arange(rows + 1, dtype=PETSc.IntType)
+        indices = (first * dof + np.arange(rows)).astype(PETSc.IntType)
+        sizes = ((rows, None), (rows, None))
+        return PETSc.Mat().createAIJ(sizes, csr=(indptr, indices, entries.ravel()), comm=comm)
+
+    def body_velocity(self, impulse: NDArray) -> NDArray:
+        """Collective. u = M^-1 D impulse, (n + g, 6 or 3); ghosts current."""
+        self._gamma.getArray()[:] = impulse.ravel()
+        self.d_transposed.multTranspose(self._gamma, self._w)
+        self.inverse_mass.mult(self._w, self._u)
+        owned = self._halo.owned
+        self._local[:owned] = self._u.getArray(readonly=True).reshape(owned, self._dof)
+        self._halo.forward(self._local)
+        return self._local
+
+    def contact_velocity(self, u: NDArray, out: NDArray) -> None:
+        """Collective. out = D^T u for body velocities u, of which the owned rows are read."""
+        self._u.getArray()[:] = u[: self._halo.owned].ravel()
+        self.d_transposed.mult(self._u, self._g)
+        out[:] = self._g.getArray(readonly=True).reshape(out.shape)
+
+    def apply(self, impulse: NDArray, out: NDArray) -> None:
+        """Collective. out = N impulse by D^T (M^-1 (D impulse))."""
+        self._gamma.getArray()[:] = impulse.ravel()
+        self.d_transposed.multTranspose(self._gamma, self._w)
+        self.inverse_mass.mult(self._w, self._u)
+        self.d_transposed.mult(self._u, self._g)
+        out[:] = self._g.getArray(readonly=True).reshape(out.shape)
+
+    def diagonal(self) -> NDArray:
+        """Return the diagonal of N, (m, columns) [1/kg]."""
+        return self._diag
+
+    def destroy(self) -> None:
+        """Collective. Free every PETSc object this operator made."""
+        for item in (self.d_transposed, self.inverse_mass, self._gamma, self._g, self._w, self._u):
+            item.destroy()

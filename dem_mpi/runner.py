@@ -1,0 +1,303 @@
+"""A whole run: place or resume, step, record, checkpoint, stop when asked, report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from dem_mpi import __version__, checkpoint
+from dem_mpi.bodies import FIELDS, Bodies
+from dem_mpi.errors import InputError, StoppedError
+from dem_mpi.h5files import require_space
+from dem_mpi.metrics import PHASES, MetricsLog, Progress, closing_table, resident_memory
+from dem_mpi.output import Field, Trajectory, frame_bytes
+from dem_mpi.parallel import Parallel
+from dem_mpi.placement import place
+from dem_mpi.scenario import LoadedScenario, Scenario, body_count, difference, frictional
+from dem_mpi.signals import StopRequest
+from dem_mpi.simulation import Simulation, SolverFailureError, StepRecord, redistribute, start
+from dem_mpi.state import State, restore, save
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a run treats what is already in its directory.
+
+    resume : continue from the newest valid checkpoint; force : replace an existing trajectory, or
+    resume although the scene has changed
+    """
+
+    directory: Path
+    resume: bool = False
+    force: bool = False
+
+
+def run(
+    parallel: Parallel,
+    loaded: LoadedScenario,
+    options: RunOptions,
+    stop: StopRequest,
+    say: Callable[[str], None],
+    on_stage: Callable[[str], None] = lambda stage: None,
+) -> None:
+    """Collective. Simulate a scene into `options.directory`; `say` prints a line for the user.
+
+    Raises StoppedError (75) after a signal, with a checkpoint written, and whatever ended the run.
+    `on_stage` is called between the stages of each checkpoint (tests end the process there).
+    """
+    Run(parallel, loaded, options, say, on_stage).execute(stop)
+
+
+class Run:
+    """One run's files and its simulation."""
+
+    def __init__(
+        self,
+        parallel: Parallel,
+        loaded: LoadedScenario,
+        options: RunOptions,
+        say: Callable[[str], None],
+        on_stage: Callable[[str], None],
+    ) -> None:
+        """Collective. Place the bodies or read the checkpoint, and open the output."""
+        self._started = perf_counter()
+        self._parallel, self._loaded, self._say = parallel, loaded, say
+        self._on_stage = on_stage
+        self._scenario = loaded.scenario
+        self._directory = options.directory
+        self._path = options.directory / loaded.scenario.output.path
+        self._stem = self._path.stem
+        self._fields = trajectory_fields(loaded.scenario)
+        self._bodies = body_count(loaded.scenario)
+        state, resumed = self._initial_state(options)
+        self._check_space(self._scenario.steps - state.step)
+        self._trajectory = self._open_trajectory(state, resumed)
+        try:
+            self._metrics = MetricsLog(
+                parallel, self._path.parent / "metrics.jsonl", state.step if resumed else -1
+            )
+            self._simulation = Simulation(parallel, self._scenario, state)
+            if not resumed:
+                self._write_frame()
+        except BaseException:
+            self._trajectory.close()
+            raise
+
+    # ---- start -----------------------------------------------------------------------------
+
+    def _initial_state(self, options: RunOptions) -> tuple[State, bool]:
+        parallel = self._parallel
+        if options.resume:
+            found = checkpoint.find(parallel, self._path.parent, self._stem)
+            for skipped in found.skipped if found else ():
+                self._say(f"skipped {skipped.path.name}: {skipped.reason}")
+            if found is not None:
+                state, scene = restore(parallel, found.path)
+                self._compare_scene(scene, found.path, options.force)
+                if state.reference is None:
+                    state = redistribute(parallel, state)
+                self._say(f"resuming from {found.path.name}, step {state.step}")
+                return state, True
+            self._say(f"no checkpoint in {self._path.parent}: starting from the beginning")
+        else:
+            self._refuse_to_replace(options.force)
+        arrays = place(self._scenario, parallel.rank, parallel.size)
+        density = [material.density for material in self._scenario.materials.values()]
+        state = start(parallel, Bodies.from_arrays(arrays, density))
+        spinning = parallel.any(bool(state.bodies.angular_velocity.any()))
+        state.rotating = spinning or frictional(self._scenario)
+        return state, False
+
+    def _refuse_to_replace(self, force: bool) -> None:
+        exists = self._parallel.broadcast(self._path.exists())
+        if exists and not force:
+            raise InputError(
+                f"{self._path} exists: --resume continues it, --force replaces it, "
+                f"--out DIR writes elsewhere"
+            )
+        if force:
+            checkpoint.remove_others(self._parallel, self._path.parent, self._stem, -1, keep=0)
+
+    def _compare_scene(self, stored: dict[str, Any], path: Path, force: bool) -> None:
+        changes = difference(stored, self._loaded.effective)
+        if not changes:
+            return
+        listing = "\n  ".join(changes)
+        if not force:
+            raise InputError(
+                f"{self._loaded.path}: the scene has changed since {path.name} was written:\n  "
+                f"{listing}\nTake the changes back, or use --force to resume with them"
+            )
+        self._say(f"resuming with a changed scene:\n  {listing}")
+
+    def _check_space(self, steps: int) -> None:
+        """Collective. Refuse to start what the disk cannot hold."""
+        frames = steps // self._scenario.output_every + 1
+        needed = frames * frame_bytes(self._fields, self._bodies)
+        needed += (self._scenario.checkpoint.keep + 1) * checkpoint_bytes(self._bodies)
+        error = None
+        if self._parallel.rank == 0:
+            try:
+                self._path.parent.mkdir(parents=True, exist_ok=True)
+                require_space(self._path, needed)
+            except Exception as caught:
+                error = caught
+        self._parallel.raise_together(error)
+
+    def _open_trajectory(self, state: State, resumed: bool) -> Trajectory:
+        scenario = self._scenario
+        attributes = {
+            "name": scenario.name,
+            "scene": _json(self._loaded.effective),
+            "scene_file": self._loaded.text,
+            "version": __version__,
+            "seed": scenario.seed,
+            "units": "SI: m, kg, s, N s, J",
+        }
+        common = {"bodies": self._bodies, "compression": scenario.output.compression}
+        if not resumed:
+            return Trajectory.create(self._parallel, self._path, self._fields, attributes, **common)
+        trajectory = Trajectory.open_for_append(
+            self._parallel, self._path, self._fields, attributes, last_step=state.step, **common
+        )
+        if trajectory.message:
+            self._say(trajectory.message)
+        return trajectory
+
+    # ---- the loop --------------------------------------------------------------------------
+
+    def execute(self, stop: StopRequest) -> None:
+        """Collective. Step to the end, to rest, or to a stop; leave all files closed."""
+        simulation, state = self._simulation, self._simulation.state
+        progress = Progress(self._parallel, state.step, self._scenario.steps, state.flagged)
+        try:
+            while state.step < self._scenario.steps and not self._at_rest():
+                record = simulation.step()
+                self._note_rest(record)
+                self._record(record)
+                progress.show(asdict(record), self._scenario.time.end, state.flagged)
+                if self._parallel.any(stop.requested):
+                    self._stop(progress, stop)
+            progress.finish()
+            self._save()
+            self._trajectory.seal({"steps": state.step, "flagged_steps": state.flagged})
+            self._report()
+        except SolverFailureError as error:
+            progress.finish()
+            if error.intact:
+                self._say(f"state before the failed step kept in {self._save().name}")
+            raise
+        finally:
+            self._metrics.close()
+            self._trajectory.close()
+            simulation.destroy()
+
+    def _stop(self, progress: Progress, stop: StopRequest) -> None:
+        """Collective. Save and raise StoppedError."""
+        progress.finish()
+        path = self._save()
+        self._report()
+        names = [name for name in self._parallel.gather(stop.name) or [] if name]
+        name = self._parallel.broadcast(names[0] if names else "")
+        raise StoppedError(
+            f"stopped by {name or 'a signal'} after step {self._simulation.state.step}; "
+            f"{path.name} is saved: run the same command with --resume"
+        )
+
+    def _at_rest(self) -> bool:
+        rest = self._scenario.time.stop_at_rest
+        return rest is not None and self._simulation.state.steps_at_rest >= rest.steps
+
+    def _note_rest(self, record: StepRecord) -> None:
+        rest, state = self._scenario.time.stop_at_rest, self._simulation.state
+        if rest is None:
+            return
+        resting = (
+            record.largest_speed < rest.max_speed and record.kinetic_speed < rest.kinetic_speed
+        )
+        state.steps_at_rest = state.steps_at_rest + 1 if resting else 0
+
+    # ---- records ---------------------------------------------------------------------------
+
+    def _record(self, record: StepRecord) -> None:
+        """Collective. The frame, the checkpoint and the line of metrics that this step is due."""
+        simulation, timer = self._simulation, self._simulation.timer
+        last = record.step == self._scenario.steps or self._at_rest()
+        with timer.phase("record"):
+            if record.step % self._scenario.output_every == 0 or last:
+                self._write_frame()
+            if record.step % self._scenario.checkpoint_every == 0 and not last:
+                self._save()
+        seconds = self._parallel.max(timer.step)
+        memory = self._parallel.max(resident_memory())
+        line = asdict(record)
+        line["seconds"] = {
+            name: round(float(s), 6) for name, s in zip(PHASES, seconds, strict=True)
+        }
+        line["memory"] = memory
+        self._metrics.write(line)
+        timer.finish_step()
+
+    def _write_frame(self) -> None:
+        state = self._simulation.state
+        time = state.step * self._scenario.time.step
+        self._trajectory.write_frame(state.step, time, state.bodies.arrays())
+
+    def _save(self) -> Path:
+        """Collective. Checkpoint; the frames before it reach the disk first."""
+        self._trajectory.sync()
+        return save(
+            self._parallel,
+            self._simulation.state,
+            self._path.parent,
+            self._stem,
+            self._loaded.effective,
+            __version__,
+            self._scenario.checkpoint.keep,
+            on_stage=self._on_stage,
+        )
+
+    def _report(self) -> None:
+        state = self._simulation.state
+        facts = [f"{self._trajectory.frames} frames in {self._path}"]
+        if state.flagged:
+            facts.append(f"{state.flagged} steps missed their tolerance and are flagged")
+        if state.removed:
+            facts.append(f"{state.removed} bodies left the domain and were removed")
+        closing_table(self._parallel, self._simulation.timer, perf_counter() - self._started, facts)
+
+
+def trajectory_fields(scenario: Scenario) -> tuple[Field, ...]:
+    """Return the columns that the scene wants in its trajectory, with their units."""
+    columns = []
+    for name in scenario.output.fields:
+        field = FIELDS[name]
+        width = field.row_shape[0] if field.row_shape else 1
+        columns.append(Field(name, _code(field.dtype), width, field.unit))
+    return tuple(columns)
+
+
+def checkpoint_bytes(bodies: int) -> int:
+    """Return about how many bytes [B] a checkpoint of so many bodies takes."""
+    row = sum(_row_bytes(name) for name in FIELDS) + 8 + 32
+    contacts = 4 * bodies
+    return bodies * row + contacts * 32
+
+
+def _row_bytes(name: str) -> int:
+    field = FIELDS[name]
+    return int(np.dtype(field.dtype).itemsize * np.prod(field.row_shape, dtype=np.int64))
+
+
+def _code(dtype: Any) -> str:
+    return np.dtype(dtype).str.lstrip("<=|")
+
+
+def _json(value: dict[str, Any]) -> str:
+    return json.dumps(value)

@@ -1,0 +1,506 @@
+"""One time step, and the loop over them.
+
+migrate -> ghosts -> contacts -> assemble D, M^-1, b -> cone solve -> v+ = v_hat + M^-1 D gamma ->
+q+ = q + h L v+ -> record.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dem_mpi import _kernels_solver as kernels
+from dem_mpi import integrator
+from dem_mpi.bodies import Bodies, ImpulseMemory
+from dem_mpi.cone import ConeProblem, Tolerance, median_of_positive
+from dem_mpi.contacts import (
+    ContactSet,
+    DetectionOptions,
+    Neighbours,
+    Reference,
+    Walls,
+    find_contacts,
+    find_neighbours,
+    recall_impulses,
+    remember_impulses,
+)
+from dem_mpi.errors import DemError
+from dem_mpi.metrics import PhaseTimer
+from dem_mpi.operators import Assembled, MatrixFree
+from dem_mpi.parallel import Parallel
+from dem_mpi.partition import balance, imbalance, migrate
+from dem_mpi.scenario import Scenario, friction_table, frictional, wall_faces
+from dem_mpi.solvers.apgd import Apgd, ApgdOptions
+from dem_mpi.solvers.result import SolveReport
+from dem_mpi.state import State
+from dem_mpi.walls import contact_velocity_of_walls, walls_at
+
+_IMBALANCE_LIMIT = 1.15  # max/mean of bodies + contacts that asks for new splitters
+_SHORTEST_STEP = 64  # shrink_step halves a step down to h / 64
+_RUNAWAY_OVERLAP = 0.5  # radii of the smaller body
+
+
+class SolverFailureError(DemError):
+    """The run cannot go on from this step; the state before the step is kept as it was.
+
+    `intact` tells whether that state is worth a checkpoint.
+    """
+
+    def __init__(self, message: str, intact: bool = True) -> None:
+        super().__init__(message)
+        self.intact = intact
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """What one time step did, the same on every rank. Energies in J, residuals as in `cone`.
+
+    energy_change is KE(v+) - KE(v_hat), energy_balance the same from the contact side:
+    -gamma.N gamma/2 + gamma.g - sum gamma_n b_phi - gamma.b_wall; the two agree to round-off.
+    """
+
+    step: int
+    time: float
+    bodies: int
+    contacts: int
+    iterations: int
+    products: int
+    converged: bool
+    reason: str
+    r_p: float
+    r_d: float
+    r_c: float
+    objective: float
+    v_ref: float
+    gamma_ref: float
+    kinetic_energy: float
+    kinetic_speed: float
+    largest_speed: float
+    energy_change: float
+    energy_balance: float
+    overlap: float
+    coincident: int
+    outside: int
+    substeps: int
+    rebuilt: bool
+    moved: int
+    ghosts: int
+    imbalance: float
+    bytes_sent: int
+
+
+@dataclass(frozen=True)
+class _Substep:
+    """A solved but not yet accepted step of length h."""
+
+    step: float
+    contacts: ContactSet
+    report: SolveReport
+    problem: ConeProblem
+    velocity: NDArray
+    angular_velocity: NDArray
+    energy_before: float
+    energy_after: float
+    energy_balance: float
+    overlap: float
+
+    @property
+    def failed(self) -> bool:
+        return not self.report.converged
+
+
+class Simulation:
+    """Advances a `State` by whole time steps. Every method that steps is collective."""
+
+    def __init__(self, parallel: Parallel, scenario: Scenario, state: State) -> None:
+        """Collective. Take over a state; a resumed one gets the pair list it had."""
+        self.parallel = parallel
+        self.scenario = scenario
+        self.state = state
+        self.timer = PhaseTimer()
+        self.frictional = frictional(scenario)
+        self._columns = 3 if self.frictional else 1
+        self._gravity = np.array(scenario.gravity)
+        self._faces = wall_faces(scenario)
+        contact = scenario.contact
+        smallest = float(state.bodies.radius.min(initial=np.inf))
+        self._detection = DetectionOptions(
+            margin=contact.margin,
+            skin=contact.skin * parallel.min(smallest),
+            friction=friction_table(scenario)[1],
+            threads=scenario.threads,
+        )
+        self._tolerance = Tolerance(
+            contact.tolerance, contact.tolerance_kind, contact.complementarity
+        )
+        self._solver = Apgd(
+            ApgdOptions(tolerance=self._tolerance, max_iterations=contact.max_iterations)
+        )
+        self._neighbours: Neighbours | None = None
+        if state.reference is not None:
+            self._neighbours = find_neighbours(
+                parallel, state.partition, state.bodies, state.reference, self._detection
+            )
+        self._operator: MatrixFree | Assembled | None = None
+        self._rebuilt, self._moved = False, 0
+
+    # ---- one step --------------------------------------------------------------------------
+
+    def step(self) -> StepRecord:
+        """Collective. Advance by one time step and return what it did.
+
+        Raises SolverFailureError on all ranks, with the state as it was before the step, if a
+        value is not a number, an overlap runs away, or the solver misses its tolerance by more
+        than the scene allows.
+        """
+        state, h = self.state, self.scenario.time.step
+        self._rebuilt, self._moved = False, 0
+        sent = self.parallel.bytes_sent
+        time = state.step * h
+        done = self._advance(time, h)
+        state.step += 1
+        outside = self._leave_domain()
+        record = self._record(done, outside, self.parallel.bytes_sent - sent)
+        if not record.converged:
+            state.flagged += 1
+        return record
+
+    def _advance(self, time: float, h: float) -> list[_Substep]:
+        """Collective. Solve and accept a step, in halves if it fails and the scene says so."""
+        substep = self._solve_step(time, h)
+        if substep.failed:
+            policy = self.scenario.contact.on_failure
+            shortest = h <= self.scenario.time.step / _SHORTEST_STEP
+            if policy == "shrink_step" and not shortest:
+                half = 0.5 * h
+                return self._advance(time, half) + self._advance(time + half, half)
+            self._refuse(substep, stop=policy != "continue_and_flag")
+        self._accept(substep)
+        return [substep]
+
+    def _solve_step(self, time: float, h: float) -> _Substep:
+        """Collective. Everything of a step but its effect on the bodies."""
+        parallel, timer, bodies = self.parallel, self.timer, self.state.bodies
+        self._check_finite()
+        self._update_neighbours(h)
+        bodies, neighbours = self.state.bodies, self._neighbours
+        assert neighbours is not None
+        walls = walls_at(self._faces, time, h)
+
+        with timer.phase("contacts"):
+            # v_hat = v + h M^-1 f_ext
+            predicted = integrator.predict(bodies, self._gravity, h)
+            position = neighbours.extend(bodies.position)
+            velocity = neighbours.extend(predicted)
+            spin = self._extend_spin(neighbours)
+            contacts = find_contacts(
+                neighbours, position, velocity, spin, walls, self._detection, h
+            )
+        with timer.phase("assemble"):
+            operator = self._make_operator(contacts, neighbours)
+            problem, b_gap, b_wall, overlap = self._make_problem(
+                operator, contacts, velocity, spin, walls, h
+            )
+            self._check_runaway(contacts, overlap)
+            guess = self._guess(contacts, h)
+        with timer.phase("solve"):
+            report = self._solver.solve(problem, guess, self.state.lipschitz)
+        with timer.phase("advance"):
+            # v+ = v_hat + M^-1 D gamma
+            owned = len(bodies)
+            u = operator.body_velocity(report.impulse)[:owned]
+            new_velocity = predicted + u[:, :3]
+            new_spin = bodies.angular_velocity + u[:, 3:] if self.frictional else spin[:owned]
+            before = integrator.kinetic_energy(bodies, predicted, bodies.angular_velocity)
+            after = integrator.kinetic_energy(bodies, new_velocity, new_spin)
+            balance_terms = _energy_balance(problem, report, b_gap, b_wall)
+            sums = parallel.sum(np.array([before, after, balance_terms]))
+        return _Substep(
+            h, contacts, report, problem, new_velocity, new_spin,
+            float(sums[0]), float(sums[1]), float(sums[2]), overlap,
+        )  # fmt: skip
+
+    def _accept(self, substep: _Substep) -> None:
+        """Give the bodies their new velocities, move them, and remember the impulses."""
+        state = self.state
+        with self.timer.phase("advance"):
+            integrator.advance(
+                state.bodies,
+                substep.velocity,
+                substep.angular_velocity,
+                substep.step,
+                state.rotating,
+                self.scenario.threads,
+            )
+            state.memory = remember_impulses(
+                substep.contacts, substep.report.impulse, self.scenario.threads
+            )
+            state.memory_step = substep.step
+            state.lipschitz = substep.report.lipschitz
+            if state.deepest < 0.0:
+                state.deepest = substep.overlap
+
+    # ---- partition and pair list -----------------------------------------------------------
+
+    def _update_neighbours(self, h: float) -> None:
+        """Collective. Migrate and list near pairs anew if the standing list may miss one."""
+        state, options = self.state, self._detection
+        with self.timer.phase("neighbours"):
+            predicted = integrator.predict(state.bodies, self._gravity, h)
+            if self._neighbours is not None:
+                drift = self._neighbours.reference.drift(state.bodies, predicted, options, h)
+                if self.parallel.max(drift) <= 0.5 * options.skin:
+                    return
+        self._rebuilt = True
+        with self.timer.phase("partition"):
+            self._repartition()
+        with self.timer.phase("neighbours"):
+            predicted = integrator.predict(state.bodies, self._gravity, h)
+            state.reference = Reference.of(self.parallel, state.bodies, predicted, options, h)
+            self._neighbours = find_neighbours(
+                self.parallel, state.partition, state.bodies, state.reference, options
+            )
+
+    def _repartition(self) -> None:
+        """Collective. Send strayed bodies home; move the splitters if the load asks for it."""
+        state, parallel = self.state, self.parallel
+        state.bodies, state.memory, moved = migrate(
+            parallel, state.partition, state.bodies, state.memory
+        )
+        self._moved += moved
+        weights = 1 + np.diff(state.memory.offsets)
+        if parallel.size > 1 and imbalance(parallel, float(weights.sum())) > _IMBALANCE_LIMIT:
+            partition = balance(parallel, state.bodies, weights)
+            state.partition = partition
+            state.bodies, state.memory, moved = migrate(
+                parallel, partition, state.bodies, state.memory
+            )
+            self._moved += moved
+
+    def _leave_domain(self) -> int:
+        """Collective. Count bodies whose centre is outside the domain, and remove them if asked."""
+        state, domain = self.state, self.scenario.domain
+        position = state.bodies.position
+        inside = np.all((position >= domain.min) & (position <= domain.max), axis=1)
+        outside = self.parallel.sum(int(np.count_nonzero(~inside)))
+        if outside and domain.on_leave == "remove":
+            stay = np.flatnonzero(inside)
+            state.bodies, state.memory = state.bodies.take(stay), state.memory.take(stay)
+            state.removed += outside
+            state.reference, self._neighbours = None, None
+        return outside
+
+    # ---- the cone problem ------------------------------------------------------------------
+
+    def _extend_spin(self, neighbours: Neighbours) -> NDArray:
+        """Collective. Angular velocities with ghosts; zeros, not sent, where nothing rotates."""
+        if self.state.rotating:
+            return neighbours.extend(self.state.bodies.angular_velocity)
+        return np.zeros((neighbours.halo.owned + neighbours.halo.ghosts, 3))
+
+    def _make_operator(
+        self, contacts: ContactSet, neighbours: Neighbours
+    ) -> MatrixFree | Assembled:
+        """Collective. N for these contacts; an assembled pattern is kept while the graph stands."""
+        masses = (neighbours.inverse_mass, neighbours.inverse_inertia, neighbours.halo)
+        if self.scenario.contact.operator == "matrix_free":
+            return MatrixFree(contacts, *masses, self.frictional, self.scenario.threads)
+        kept = self._operator if isinstance(self._operator, Assembled) else None
+        if kept is not None and not self._rebuilt and kept.refill(contacts):
+            return kept
+        if kept is not None:
+            kept.destroy()
+        self._operator = Assembled(contacts, *masses, self.frictional, self.parallel)
+        return self._operator
+
+    def _make_problem(
+        self,
+        operator: MatrixFree | Assembled,
+        contacts: ContactSet,
+        velocity: NDArray,
+        spin: NDArray,
+        walls: Walls,
+        h: float,
+    ) -> tuple[ConeProblem, NDArray, NDArray | None, float]:
+        """Collective. b = (b_phi, 0, 0) + D^T v_hat + b_wall and the scales of its residuals.
+
+        b_phi = max(phi/h, -v_rec): overlap is pushed out at a bounded speed. Returns the problem,
+        b_phi (m,), b_wall (m, columns) or None, and the deepest overlap in smaller radii.
+        """
+        b = np.empty((contacts.count, self._columns))
+        motion = np.hstack((velocity, spin)) if self.frictional else velocity
+        operator.contact_velocity(motion, b)
+        b_wall = None
+        wall_velocity = contact_velocity_of_walls(contacts, walls)
+        if wall_velocity is not None:
+            b_wall = np.empty_like(b)
+            kernels.to_contact.serial(contacts.normal, wall_velocity, b_wall)
+            b += b_wall
+        fastest = float(np.sqrt(np.max(np.sum(b * b, axis=1), initial=0.0)))
+        recovery = self.scenario.contact.recovery_speed
+        b_gap = contacts.gap / h
+        if recovery is not None:
+            np.maximum(b_gap, -recovery, out=b_gap)
+        b[:, 0] += b_gap
+        smaller = contacts.arm[:, 0] - 0.5 * contacts.gap
+        pair = contacts.b >= 0
+        smaller[pair] = np.minimum(smaller[pair], (contacts.arm[:, 1] - 0.5 * contacts.gap)[pair])
+        overlap = float(np.max(-contacts.gap / smaller, initial=0.0))
+        largest = self.parallel.max(np.array([fastest, overlap]))
+        v_ref = max(h * float(np.linalg.norm(self._gravity)), float(largest[0]))
+        gamma_ref = v_ref / median_of_positive(operator.diagonal(), self.parallel)
+        problem = ConeProblem(
+            operator, b, contacts.friction, v_ref, gamma_ref, self.parallel, self.scenario.threads
+        )
+        return problem, b_gap, b_wall, float(largest[1])
+
+    def _guess(self, contacts: ContactSet, h: float) -> NDArray:
+        """Impulses of the last step where the contacts stand, scaled with the step length."""
+        if not (self.scenario.contact.warm_start and self.state.memory_step > 0.0):
+            return np.zeros((contacts.count, self._columns))
+        scale = h / self.state.memory_step
+        return recall_impulses(
+            contacts, self.state.memory, self._columns, scale, self.scenario.threads
+        )
+
+    # ---- faults ----------------------------------------------------------------------------
+
+    def _check_finite(self) -> None:
+        """Collective. Raise if a position or velocity is not a number, naming the body."""
+        gid = self.parallel.max(integrator.find_not_finite(self.state.bodies))
+        if gid >= 0:
+            raise SolverFailureError(
+                f"step {self.state.step + 1}: position or velocity of body {gid} is not finite"
+            )
+
+    def _refuse(self, substep: _Substep, stop: bool) -> None:
+        """Collective. Raise unless the scene lets a step that missed its tolerance pass."""
+        step, report = self.state.step + 1, substep.report
+        residuals = report.residuals
+        limit = self._tolerance.value
+        if self._tolerance.kind == "scaled":
+            limit *= substep.problem.velocity_scale
+        if not residuals.finite:
+            why = "a residual is not a number"
+        elif stop:
+            why = f"the solver missed its tolerance ({report.reason})"
+        elif residuals.dual > self.scenario.contact.stop_factor * limit:
+            why = (
+                f"the residual exceeds {self.scenario.contact.stop_factor:g} times the tolerance "
+                f"({report.reason})"
+            )
+        else:
+            return
+        g, mu = report.velocity, substep.contacts.friction
+        violation = mu * np.sqrt(np.sum(g[:, 1:] ** 2, axis=1)) - g[:, 0]
+        low, high = self._worst_contact(substep.contacts, violation)
+        raise SolverFailureError(
+            f"step {step}: {why}: r_d = {residuals.dual:.3g} m/s, worst at the contact of body "
+            f"{low} with {self._name(high)}. Raise contact.max_iterations, lower time.step, or set "
+            f"contact.on_failure: shrink_step"
+        )
+
+    def _worst_contact(self, contacts: ContactSet, measure: NDArray) -> tuple[int, int]:
+        """Collective. The gids of the contact with the largest, or an undefined, measure (m,)."""
+        measure = np.nan_to_num(measure, nan=np.inf, posinf=np.inf)
+        mine = np.array([-np.inf, -1.0, 0.0])
+        if measure.size:
+            i = int(np.argmax(measure))
+            mine[:] = measure[i], self.state.bodies.gid[contacts.a[i]], contacts.other[i]
+        every = self.parallel.allgather(mine)
+        worst = every[int(np.argmax(every[:, 0]))]
+        return int(worst[1]), int(worst[2])
+
+    def _check_runaway(self, contacts: ContactSet, overlap: float) -> None:
+        """Collective. Raise if bodies sank into each other further than they were at the start."""
+        allowed = max(_RUNAWAY_OVERLAP, 1.05 * self.state.deepest)
+        if self.state.deepest < 0.0 or overlap <= allowed:
+            return
+        depth = -contacts.gap / self.state.bodies.radius[contacts.a]
+        low, high = self._worst_contact(contacts, depth)
+        raise SolverFailureError(
+            f"step {self.state.step + 1}: an overlap of {overlap:.2g} radii, over {allowed:.2g}, "
+            f"of body {low} with {self._name(high)}: bodies pass through each other; lower time.step "
+            f"or contact.tolerance",
+            intact=False,
+        )
+
+    def _name(self, other: int) -> str:
+        return f"body {other}" if other >= 0 else f"wall '{self._faces.name[-other - 1]}'"
+
+    # ---- records ---------------------------------------------------------------------------
+
+    def _record(self, done: list[_Substep], outside: int, sent: int) -> StepRecord:
+        """Collective. Sum up the substeps of a step over ranks."""
+        state, parallel, last = self.state, self.parallel, done[-1]
+        motion = integrator.measure(parallel, state.bodies)
+        halo = self._neighbours.halo.ghosts if self._neighbours is not None else 0
+        load = float(len(state.bodies) + last.contacts.count)
+        counts = np.array([last.contacts.count, last.contacts.coincident, halo, sent])
+        counts = parallel.sum(counts.astype(np.int64))
+        residuals = [s.report.residuals for s in done]
+        missed = [s.report.reason for s in done if s.failed]
+        return StepRecord(
+            step=state.step,
+            time=state.step * self.scenario.time.step,
+            bodies=motion.bodies,
+            contacts=int(counts[0]),
+            iterations=sum(s.report.iterations for s in done),
+            products=sum(s.report.products for s in done),
+            converged=not missed,
+            reason=missed[0] if missed else "converged",
+            r_p=max(r.primal for r in residuals),
+            r_d=max(r.dual for r in residuals),
+            r_c=max(r.complementarity for r in residuals),
+            objective=last.report.residuals.objective,
+            v_ref=last.problem.velocity_scale,
+            gamma_ref=last.problem.impulse_scale,
+            kinetic_energy=motion.kinetic_energy,
+            kinetic_speed=motion.kinetic_speed,
+            largest_speed=motion.largest_speed,
+            energy_change=sum(s.energy_after - s.energy_before for s in done),
+            energy_balance=sum(s.energy_balance for s in done),
+            overlap=max(s.overlap for s in done),
+            coincident=int(counts[1]),
+            outside=outside,
+            substeps=len(done),
+            rebuilt=self._rebuilt,
+            moved=self._moved,
+            ghosts=int(counts[2]),
+            imbalance=imbalance(parallel, load),
+            bytes_sent=int(counts[3]),
+        )
+
+    def destroy(self) -> None:
+        """Collective. Free the PETSc objects."""
+        if self._operator is not None:
+            self._operator.destroy()
+            self._operator = None
+
+
+def start(parallel: Parallel, bodies: Bodies) -> State:
+    """Collective. The state of newly placed bodies, divided among the ranks."""
+    memory = ImpulseMemory.empty(len(bodies))
+    partition = balance(parallel, bodies, np.ones(len(bodies), dtype=np.int64))
+    bodies, memory, _ = migrate(parallel, partition, bodies, memory)
+    return State(bodies=bodies, memory=memory, partition=partition)
+
+
+def redistribute(parallel: Parallel, state: State) -> State:
+    """Collective. A state read on another number of ranks, divided among these."""
+    partition = balance(parallel, state.bodies, 1 + np.diff(state.memory.offsets))
+    bodies, memory, _ = migrate(parallel, partition, state.bodies, state.memory)
+    return replace(state, bodies=bodies, memory=memory, partition=partition, reference=None)
+
+
+def _energy_balance(
+    problem: ConeProblem, report: SolveReport, b_gap: NDArray, b_wall: NDArray | None
+) -> float:
+    """-gamma.N gamma/2 + gamma.g - sum gamma_n b_phi - gamma.b_wall of this rank's contacts [J]."""
+    gamma = report.impulse
+    work = float(np.sum(gamma * report.velocity))
+    push = float(np.sum(gamma * problem.b))
+    total = -0.5 * (work - push) + work - float(np.sum(gamma[:, 0] * b_gap))
+    return total - (float(np.sum(gamma * b_wall)) if b_wall is not None else 0.0)

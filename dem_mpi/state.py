@@ -1,0 +1,143 @@
+"""Everything a run needs to go on bit for bit, and its way into a checkpoint and back."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dem_mpi import checkpoint
+from dem_mpi.bodies import FIELDS, Bodies, ImpulseMemory
+from dem_mpi.contacts import Reference
+from dem_mpi.errors import DataError
+from dem_mpi.parallel import Parallel
+from dem_mpi.partition import Partition
+
+_RAGGED = {"impulses": ("bodies", "impulse_count")}
+
+
+@dataclass
+class State:
+    """The bodies of this rank and all that later steps depend on.
+
+    memory      : impulses of the last step, for warm starts; made with step `memory_step` [s]
+    reference   : where the standing list of near pairs was made; None asks for a new one
+    lipschitz   : step-size constant of the last solve
+    deepest     : overlap that the run started with, in radii of the smaller body
+    rotating    : whether orientations change at all
+    flagged     : steps that missed their tolerance; removed : bodies that left the domain
+    """
+
+    bodies: Bodies
+    memory: ImpulseMemory
+    partition: Partition
+    reference: Reference | None = None
+    step: int = 0
+    memory_step: float = 0.0
+    lipschitz: float = 0.0
+    deepest: float = -1.0
+    rotating: bool = True
+    flagged: int = 0
+    removed: int = 0
+    steps_at_rest: int = 0
+    counters: dict[str, int] = field(default_factory=dict)
+
+
+def save(
+    parallel: Parallel,
+    state: State,
+    directory: Path,
+    stem: str,
+    effective: dict[str, Any],
+    version: str,
+    keep: int,
+    **options: Any,
+) -> Path:
+    """Collective. Write the state as a checkpoint and return its path."""
+    bodies = dict(state.bodies.arrays())
+    bodies["impulse_count"] = np.diff(state.memory.offsets)
+    reference = state.reference
+    if reference is not None:
+        bodies["reference_position"] = reference.position
+        bodies["reference_reach"] = reference.reach
+    partition = state.partition
+    shared = {
+        "origin": partition.origin,
+        "splitter_key": partition.splitter_key,
+        "splitter_gid": partition.splitter_gid,
+        "reference_frame": reference.frame if reference is not None else np.zeros(3),
+    }
+    attributes = {
+        "scene": json.dumps(effective),
+        "version": version,
+        "edge": partition.edge,
+        "memory_step": state.memory_step,
+        "lipschitz": state.lipschitz,
+        "deepest": state.deepest,
+        "rotating": int(state.rotating),
+        "flagged": state.flagged,
+        "removed": state.removed,
+        "steps_at_rest": state.steps_at_rest,
+        "counters": json.dumps(state.counters),
+    }
+    groups = {
+        "bodies": bodies,
+        "impulses": {"other": state.memory.other, "impulse": state.memory.impulse},
+    }
+    return checkpoint.write(
+        parallel, directory, stem, state.step, groups, shared, attributes,
+        ragged=_RAGGED, keep=keep, **options,
+    )  # fmt: skip
+
+
+def restore(parallel: Parallel, path: Path) -> tuple[State, dict[str, Any]]:
+    """Collective. Read a checkpoint; return the state and the effective scene it was made by.
+
+    On as many ranks as wrote it the state is the written one, bit for bit. On another number each
+    rank has an equal slice of the bodies, the partition is the old one and the reference is gone:
+    the caller divides them anew.
+    """
+    stored = checkpoint.read(parallel, path)
+    try:
+        state = _state_of(stored, parallel)
+        scene = json.loads(stored.attributes["scene"])
+        problem = None
+    except (KeyError, ValueError) as error:
+        problem = DataError(f"{path}: not a state of this program: {error}")
+    parallel.raise_together(problem)
+    return state, scene
+
+
+def _state_of(stored: checkpoint.Checkpoint, parallel: Parallel) -> State:
+    rows, shared, attributes = stored.groups["bodies"], stored.shared, stored.attributes
+    bodies = Bodies(**{name: rows[name] for name in FIELDS})
+    offsets = np.concatenate(([0], np.cumsum(rows["impulse_count"], dtype=np.int64)))
+    impulses = stored.groups["impulses"]
+    reference = None
+    if stored.ranks == parallel.size and "reference_position" in rows:
+        reference = Reference(
+            rows["reference_position"], rows["reference_reach"], shared["reference_frame"]
+        )
+    return State(
+        bodies=bodies,
+        memory=ImpulseMemory(offsets, impulses["other"], impulses["impulse"]),
+        partition=Partition(
+            shared["origin"],
+            float(attributes["edge"]),
+            shared["splitter_key"],
+            shared["splitter_gid"],
+        ),
+        reference=reference,
+        step=stored.step,
+        memory_step=float(attributes["memory_step"]),
+        lipschitz=float(attributes["lipschitz"]),
+        deepest=float(attributes["deepest"]),
+        rotating=bool(attributes["rotating"]),
+        flagged=int(attributes["flagged"]),
+        removed=int(attributes["removed"]),
+        steps_at_rest=int(attributes["steps_at_rest"]),
+        counters={k: int(v) for k, v in json.loads(attributes["counters"]).items()},
+    )

@@ -1,0 +1,71 @@
+"""Compile every kernel before the work starts, by one rank first: two would race on the cache."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from dem_mpi.bodies import Bodies
+from dem_mpi.errors import InputError
+from dem_mpi.parallel import Parallel
+from dem_mpi.scenario import parse_scenario
+from dem_mpi.simulation import Simulation, start
+
+# Every kernel of a run is called in two steps of this scene, once with friction, once without.
+_SCENE = """
+domain: {{min: [-1, -1, -1], max: [1, 1, 1]}}
+materials: {{m: {{density: 1000}}}}
+friction: {{default: {mu}}}
+bodies:
+  - {{material: m, count: 4, radius: 0.1,
+      placement: {{jittered_grid: {{min: [0, 0, 0], max: [0.4, 0.4, 0.2]}}}}}}
+walls:
+  - {{shape: plane, material: m, point: [0, 0, 0], normal: [0, 0, 1],
+      motion: {{velocity: [0, 0, 0.1]}}}}
+time: {{step: 1e-3, end: 2e-3}}
+threads: {threads}
+contact: {{operator: {operator}, max_iterations: 3, stop_factor: 1e9}}
+"""
+
+
+def set_threads(threads: int) -> None:
+    """Use so many threads a rank. Raises InputError if numba was started with fewer."""
+    available = int(numba.config.NUMBA_NUM_THREADS)
+    if threads > available:
+        raise InputError(
+            f"threads = {threads}: this process may use {available}; lower threads, or set "
+            f"NUMBA_NUM_THREADS and let the launcher give each rank more cores"
+        )
+    numba.set_num_threads(threads)
+
+
+def warm_up(parallel: Parallel, threads: int) -> None:
+    """Collective. Compile on rank 0, then load on the others."""
+    error = None
+    for turn in (True, False):
+        if (parallel.rank == 0) == turn:
+            try:
+                _exercise(threads)
+            except Exception as caught:
+                error = caught
+        parallel.raise_together(error)
+
+
+def _exercise(threads: int) -> None:
+    """Run two steps of a scene of four bodies on this rank alone."""
+    alone = Parallel.alone()
+    for mu, operator in ((0.3, "matrix_free"), (0.0, "matrix_free"), (0.3, "assembled")):
+        text = _SCENE.format(mu=mu, threads=threads, operator=operator)
+        scenario = parse_scenario(text, "warm-up").scenario
+        position = np.array([[0.0, 0, 0.1], [0.2, 0, 0.1], [0, 0.2, 0.1], [0.2, 0.2, 0.1]])
+        arrays = {
+            "gid": np.arange(4),
+            "material": np.zeros(4, np.int32),
+            "radius": np.full(4, 0.1),
+            "position": position,
+        }
+        state = start(alone, Bodies.from_arrays(arrays, np.array([1000.0])))
+        simulation = Simulation(alone, scenario, state)
+        simulation.step()
+        simulation.step()
+        simulation.destroy()
