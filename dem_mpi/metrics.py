@@ -167,7 +167,9 @@ def closing_table(parallel: Parallel, timer: PhaseTimer, wall: float, facts: lis
             name, f"{column.min():.2f}", f"{mean:.2f}", f"{column.max():.2f}", ratio,
             f"{100 * mean / spent:.0f} %",
         )  # fmt: skip
-    console = Console(file=sys.stdout, highlight=False)
+    console = Console(
+        file=sys.stdout, highlight=False, force_terminal=sys.stdout.isatty(), soft_wrap=True
+    )
     console.print(table)
     memory = seconds[:, -1] / 2**20
     console.print(

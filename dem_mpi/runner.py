@@ -227,7 +227,7 @@ class Run:
 
     def _record(self, record: StepRecord) -> None:
         """Collective. The frame, the checkpoint and the line of metrics that this step is due."""
-        simulation, timer = self._simulation, self._simulation.timer
+        timer = self._simulation.timer
         last = record.step == self._scenario.steps or self._at_rest()
         with timer.phase("record"):
             if record.step % self._scenario.output_every == 0 or last:

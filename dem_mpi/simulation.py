@@ -422,8 +422,8 @@ class Simulation:
         low, high = self._worst_contact(contacts, depth)
         raise SolverFailureError(
             f"step {self.state.step + 1}: an overlap of {overlap:.2g} radii, over {allowed:.2g}, "
-            f"of body {low} with {self._name(high)}: bodies pass through each other; lower time.step "
-            f"or contact.tolerance",
+            f"of body {low} with {self._name(high)}: bodies pass through each other; lower "
+            f"time.step or contact.tolerance",
             intact=False,
         )
 
