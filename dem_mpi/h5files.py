@@ -317,11 +317,17 @@ class SharedFile:
                 fsync(self.path)
 
     def close(self) -> None:
-        """Collective. Close; a second call does nothing."""
+        """Collective. Close and give back what was reserved; a second call does nothing."""
         file, self.file = self.file, None
+        size = 0
         with agree(self.parallel, self.path, "close"):
             if file is not None:
+                h5f.flush(file.id)
+                size = file.id.get_filesize()
                 file.close()
+        with agree(self.parallel, self.path, "close"):
+            if file is not None and self.parallel.rank == 0 and size < self.path.stat().st_size:
+                os.truncate(self.path, size)
 
     def abandon(self) -> None:
         """Collective. Close after a reported error; what closing says now adds nothing."""
@@ -428,7 +434,7 @@ def _check_dataset(path: Path, dataset: h5py.Dataset, place: str) -> None:
     properties = dataset.id.get_create_plist()
     layout = properties.get_layout()
     if properties.get_external_count():
-        raise DataError(f"{path}: the data of '{place}' lie in another file: refused")
+        raise DataError(f"{path}: '{place}' has its data in another file: refused")
     if layout not in (h5d.COMPACT, h5d.CONTIGUOUS, h5d.CHUNKED):
         raise DataError(f"{path}: '{place}' is a view of other data sets: refused")
     if dataset.dtype.kind not in "biufS" or dataset.dtype.hasobject:

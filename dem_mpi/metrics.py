@@ -46,6 +46,22 @@ class PhaseTimer:
         self.step[:] = 0.0
 
 
+def on_terminal() -> bool:
+    """Whether a person watches standard output.
+
+    Open MPI gives every rank a pseudo-terminal of its own, whatever mpirun itself writes to: there
+    the parent process's output decides.
+    """
+    if not sys.stdout.isatty():
+        return False
+    if "OMPI_COMM_WORLD_RANK" not in os.environ:
+        return True
+    try:
+        return os.readlink(f"/proc/{os.getppid()}/fd/1").startswith(("/dev/pts/", "/dev/tty"))
+    except OSError:
+        return False
+
+
 def peak_memory() -> int:
     """Return the largest resident memory this process has had [B]."""
     scale = 1 if sys.platform == "darwin" else 1024
@@ -103,7 +119,7 @@ class Progress:
 
     def __init__(self, parallel: Parallel, first_step: int, steps: int, flagged: int) -> None:
         self._quiet = parallel.rank != 0
-        self._live = sys.stdout.isatty()
+        self._live = on_terminal()
         self._first, self._steps = first_step, steps
         self._started = self._last = perf_counter()
         self._shown = False
@@ -168,7 +184,7 @@ def closing_table(parallel: Parallel, timer: PhaseTimer, wall: float, facts: lis
             f"{100 * mean / spent:.0f} %",
         )  # fmt: skip
     console = Console(
-        file=sys.stdout, highlight=False, force_terminal=sys.stdout.isatty(), soft_wrap=True
+        file=sys.stdout, highlight=False, force_terminal=on_terminal(), soft_wrap=True
     )
     console.print(table)
     memory = seconds[:, -1] / 2**20
