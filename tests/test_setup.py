@@ -86,6 +86,9 @@ def project(tmp_path) -> Path:
         shutil.copy(ROOT / name, root)
     (root / "dem_mpi").mkdir()
     shutil.copy(ROOT / "dem_mpi" / "__init__.py", root / "dem_mpi")
+    (root / "dem_mpi" / "__main__.py").write_text(
+        f"import sys\nopen({str(tmp_path / 'warmed')!r}, 'a').write(sys.argv[1] + ' ')\n"
+    )
     return root
 
 
@@ -130,7 +133,7 @@ def test_own_stack_is_used_without_system_packages_and_only_once(
     env = with_path(fake_system, PYTHON=str(own_stack))
     bootstrap = project / "scripts" / "bootstrap"
 
-    first = shell(bootstrap, "--no-warmup", env=env)
+    first = shell(bootstrap, env=env)
     log = project / ".bootstrap.log"
     assert first.returncode == 0, first.stderr + (log.read_text() if log.exists() else "")
     assert not (tmp_path / "calls").exists(), "a system package manager was called"
@@ -142,17 +145,24 @@ def test_own_stack_is_used_without_system_packages_and_only_once(
     ]
     assert (project / ".venv" / "bin" / "dem-mpi").exists()
 
+    warmed = tmp_path / "warmed"
+    assert warmed.read_text() == "warmup "
+
     calls = (tmp_path / "python_calls").read_text()
-    again = shell(bootstrap, "--no-warmup", env=env)
+    again = shell(bootstrap, env=env)
     assert again.returncode == 0
     assert again.stderr == "bootstrap: nothing is missing\n"
     assert (tmp_path / "python_calls").read_text() == calls
-    assert shell(bootstrap, "--no-warmup", "--quiet", env=env).stderr == ""
+    assert shell(bootstrap, "--quiet", env=env).stderr == ""
+
+    (project / "dem_mpi" / "_kernels.py").touch()
+    assert shell(bootstrap, env=env).returncode == 0
+    assert warmed.read_text() == "warmup warmup ", "new kernels were not compiled"
 
     # Damage is noticed: a module that is gone is looked for again.
     pointer = next((project / ".venv").glob("lib/python*/site-packages/mpi_stack.pth"))
     pointer.write_text("")
-    repaired = shell(bootstrap, "--no-warmup", env=env)
+    repaired = shell(bootstrap, env=env)
     assert repaired.returncode == 0, repaired.stderr
     assert "petsc4py" in shell(project / ".venv" / "bin" / "python", "-P", "-c", program).stdout
 
