@@ -92,6 +92,20 @@ class StepRecord:
 
 
 @dataclass(frozen=True)
+class _Posed:
+    """The cone problem of a step and what it was made from; predicted is v_hat (n, 3)."""
+
+    contacts: ContactSet
+    operator: MatrixFree | Assembled
+    problem: ConeProblem
+    guess: NDArray
+    predicted: NDArray
+    b_gap: NDArray
+    b_wall: NDArray | None
+    overlap: float
+
+
+@dataclass(frozen=True)
 class _Substep:
     """A solved but not yet accepted step of length h."""
 
@@ -182,13 +196,41 @@ class Simulation:
 
     def _solve_step(self, time: float, h: float) -> _Substep:
         """Collective. Everything of a step but its effect on the bodies."""
-        parallel, timer, bodies = self.parallel, self.timer, self.state.bodies
+        posed = self._pose(time, h)
+        with self.timer.phase("solve"):
+            report = self._solver.solve(posed.problem, posed.guess, self.state.lipschitz)
+        with self.timer.phase("advance"):
+            # v+ = v_hat + M^-1 D gamma
+            bodies, spin = self.state.bodies, self.state.bodies.angular_velocity
+            u = posed.operator.body_velocity(report.impulse)[: len(bodies)]
+            new_velocity = posed.predicted + u[:, :3]
+            new_spin = spin + u[:, 3:] if self.frictional else spin
+            before = integrator.kinetic_energy(bodies, posed.predicted, spin)
+            after = integrator.kinetic_energy(bodies, new_velocity, new_spin)
+            balance_terms = _energy_balance(posed.problem, report, posed.b_gap, posed.b_wall)
+            sums = self.parallel.sum(np.array([before, after, balance_terms]))
+        return _Substep(
+            h, posed.contacts, report, posed.problem, new_velocity, new_spin,
+            float(sums[0]), float(sums[1]), float(sums[2]), posed.overlap,
+        )  # fmt: skip
+
+    def pose(self) -> tuple[ConeProblem, NDArray]:
+        """Collective. The cone problem of the next step and the warm start it would begin from.
+
+        Bodies may migrate and the pair list may be made anew, as in a step; nothing moves.
+        """
+        h = self.scenario.time.step
+        posed = self._pose(self.state.step * h, h)
+        return posed.problem, posed.guess
+
+    def _pose(self, time: float, h: float) -> _Posed:
+        """Collective. Find the contacts of a step and set up their cone problem."""
+        timer = self.timer
         self._check_finite()
         self._update_neighbours(h)
         bodies, neighbours = self.state.bodies, self._neighbours
         assert neighbours is not None
         walls = walls_at(self._faces, time, h)
-
         with timer.phase("contacts"):
             # v_hat = v + h M^-1 f_ext
             predicted = integrator.predict(bodies, self._gravity, h)
@@ -205,22 +247,7 @@ class Simulation:
             )
             self._check_runaway(contacts, overlap)
             guess = self._guess(contacts, h)
-        with timer.phase("solve"):
-            report = self._solver.solve(problem, guess, self.state.lipschitz)
-        with timer.phase("advance"):
-            # v+ = v_hat + M^-1 D gamma
-            owned = len(bodies)
-            u = operator.body_velocity(report.impulse)[:owned]
-            new_velocity = predicted + u[:, :3]
-            new_spin = bodies.angular_velocity + u[:, 3:] if self.frictional else spin[:owned]
-            before = integrator.kinetic_energy(bodies, predicted, bodies.angular_velocity)
-            after = integrator.kinetic_energy(bodies, new_velocity, new_spin)
-            balance_terms = _energy_balance(problem, report, b_gap, b_wall)
-            sums = parallel.sum(np.array([before, after, balance_terms]))
-        return _Substep(
-            h, contacts, report, problem, new_velocity, new_spin,
-            float(sums[0]), float(sums[1]), float(sums[2]), overlap,
-        )  # fmt: skip
+        return _Posed(contacts, operator, problem, guess, predicted, b_gap, b_wall, overlap)
 
     def _accept(self, substep: _Substep) -> None:
         """Give the bodies their new velocities, move them, and remember the impulses."""

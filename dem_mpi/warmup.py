@@ -69,3 +69,4 @@ def _exercise(threads: int) -> None:
         simulation.step()
         simulation.step()
         simulation.destroy()
+    alone.free()

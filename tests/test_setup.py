@@ -236,7 +236,7 @@ def stage(tmp_path) -> Path:
     (tmp_path / "application.py").write_text(APPLICATION)
     executable(
         tmp_path / ".venv" / "bin" / "python",
-        f'#!/bin/sh\nshift 2\nexec "{sys.executable}" "{tmp_path}/application.py" "$@"\n',
+        f'#!/bin/sh\nshift 3\nexec "{sys.executable}" "{tmp_path}/application.py" "$@"\n',
     )
     return tmp_path
 
