@@ -306,6 +306,10 @@ class Simulation:
             )
             self._moved += moved
 
+    def forget_neighbours(self) -> None:
+        """Make the next step list near pairs anew, as it does when bodies have moved far."""
+        self.state.reference, self._neighbours = None, None
+
     def _leave_domain(self) -> int:
         """Collective. Count bodies whose centre is outside the domain, and remove them if asked."""
         state, domain = self.state, self.scenario.domain
@@ -316,7 +320,7 @@ class Simulation:
             stay = np.flatnonzero(inside)
             state.bodies, state.memory = state.bodies.take(stay), state.memory.take(stay)
             state.removed += outside
-            state.reference, self._neighbours = None, None
+            self.forget_neighbours()
         return outside
 
     # ---- the cone problem ------------------------------------------------------------------
