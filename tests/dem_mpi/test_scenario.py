@@ -13,7 +13,6 @@ import jsonschema
 import numpy as np
 import pytest
 import yaml
-from scene_header import read_header
 
 from dem_mpi import yaml_reader
 from dem_mpi.errors import InputError
@@ -29,6 +28,8 @@ from dem_mpi.scenario import (
     wall_faces,
 )
 from dem_mpi.yaml_reader import MAX_BYTES, parse
+
+from scene_header import read_header
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.yaml"))
 
