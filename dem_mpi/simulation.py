@@ -6,6 +6,7 @@ q+ = q + h L v+ -> record.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -139,13 +140,7 @@ class Simulation:
         self._gravity = np.array(scenario.gravity)
         self._faces = wall_faces(scenario)
         contact = scenario.contact
-        smallest = float(state.bodies.radius.min(initial=np.inf))
-        self._detection = DetectionOptions(
-            margin=contact.margin,
-            skin=contact.skin * parallel.min(smallest),
-            friction=friction_table(scenario)[1],
-            threads=scenario.threads,
-        )
+        self._detection = self._detection_options()
         self._tolerance = Tolerance(
             contact.tolerance, contact.tolerance_kind, contact.complementarity
         )
@@ -188,11 +183,21 @@ class Simulation:
             policy = self.scenario.contact.on_failure
             shortest = h <= self.scenario.time.step / _SHORTEST_STEP
             if policy == "shrink_step" and not shortest:
-                half = 0.5 * h
-                return self._advance(time, half) + self._advance(time + half, half)
+                return self._advance_by_halves(time, h)
             self._refuse(substep, stop=policy != "continue_and_flag")
         self._accept(substep)
         return [substep]
+
+    def _advance_by_halves(self, time: float, h: float) -> list[_Substep]:
+        """Collective. Two half steps, or the state as it was before the first one."""
+        state, half = self.state, 0.5 * h
+        every = np.arange(len(state.bodies))
+        kept = replace(state, bodies=state.bodies.take(every)), self._neighbours
+        try:
+            return self._advance(time, half) + self._advance(time + half, half)
+        except SolverFailureError:
+            self.state, self._neighbours = kept
+            raise
 
     def _solve_step(self, time: float, h: float) -> _Substep:
         """Collective. Everything of a step but its effect on the bodies."""
@@ -250,8 +255,9 @@ class Simulation:
         return _Posed(contacts, operator, problem, guess, predicted, b_gap, b_wall, overlap)
 
     def _accept(self, substep: _Substep) -> None:
-        """Give the bodies their new velocities, move them, and remember the impulses."""
+        """Collective. Give the bodies new velocities, move them, and remember the impulses."""
         state = self.state
+        self._check_new_velocity(substep)
         with self.timer.phase("advance"):
             integrator.advance(
                 state.bodies,
@@ -270,6 +276,17 @@ class Simulation:
                 state.deepest = substep.overlap
 
     # ---- partition and pair list -----------------------------------------------------------
+
+    def _detection_options(self) -> DetectionOptions:
+        """Collective. Margin, skin and friction of the present bodies' pair lists."""
+        contact = self.scenario.contact
+        smallest = float(self.state.bodies.radius.min(initial=np.inf))
+        return DetectionOptions(
+            margin=contact.margin,
+            skin=contact.skin * self.parallel.min(smallest),
+            friction=friction_table(self.scenario)[1],
+            threads=self.scenario.threads,
+        )
 
     def _update_neighbours(self, h: float) -> None:
         """Collective. Migrate and list near pairs anew if the standing list may miss one."""
@@ -321,6 +338,8 @@ class Simulation:
             state.bodies, state.memory = state.bodies.take(stay), state.memory.take(stay)
             state.removed += outside
             self.forget_neighbours()
+            # A run resumed from here would know the remaining bodies alone.
+            self._detection = self._detection_options()
         return outside
 
     # ---- the cone problem ------------------------------------------------------------------
@@ -403,8 +422,23 @@ class Simulation:
         gid = self.parallel.max(integrator.find_not_finite(self.state.bodies))
         if gid >= 0:
             raise SolverFailureError(
-                f"step {self.state.step + 1}: position or velocity of body {gid} is not finite"
+                f"step {self.state.step + 1}: position or velocity of body {gid} is not finite",
+                intact=False,
             )
+
+    def _check_new_velocity(self, substep: _Substep) -> None:
+        """Collective. Raise before a velocity that is not a number reaches the bodies."""
+        if math.isfinite(substep.energy_after):  # the sum over all ranks
+            return
+        new = replace(
+            self.state.bodies,
+            velocity=substep.velocity,
+            angular_velocity=substep.angular_velocity,
+        )
+        gid = self.parallel.max(integrator.find_not_finite(new))
+        raise SolverFailureError(
+            f"step {self.state.step + 1}: the new velocity of body {gid} is not finite"
+        )
 
     def _refuse(self, substep: _Substep, stop: bool) -> None:
         """Collective. Raise unless the scene lets a step that missed its tolerance pass."""
