@@ -22,9 +22,20 @@ class StopRequest:
         return bool(self.name)
 
     def install(self) -> None:
-        """Heed USR1, TERM and INT from now on."""
+        """Heed USR1, TERM and INT from now on; once one has come there is no more to heed."""
+        if self.requested:
+            return
         for number in (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._remember)
 
+    def ignore(self) -> None:
+        """Let USR1 pass from now on.
+
+        The launcher may send it until the process has ended, and Python restores the deadly
+        default while it shuts down.
+        """
+        signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+
     def _remember(self, number: int, frame: FrameType | None) -> None:
         self.name = signal.Signals(number).name
+        self.ignore()
