@@ -214,6 +214,7 @@ def main() -> None:
             code = InputError.exit_code
         else:
             raise
+    STOP.ignore()
     sys.stdout.flush()
     sys.exit(code if isinstance(code, int) else 0)
 

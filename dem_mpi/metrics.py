@@ -5,6 +5,7 @@ Nothing here changes a result: clocks are read, never decided by.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -19,6 +20,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from dem_mpi.h5files import agree
 from dem_mpi.parallel import Parallel
 
 PHASES = ("partition", "neighbours", "contacts", "assemble", "solve", "advance", "record")
@@ -81,23 +83,27 @@ class MetricsLog:
     """`metrics.jsonl`: one line a step, written by rank 0 and flushed."""
 
     def __init__(self, parallel: Parallel, path: Path, last_step: int) -> None:
-        """Open for appending and drop lines after `last_step` (-1: all) that a crash left."""
+        """Collective. Open for appending; drop lines after `last_step` (-1: all) of a crash."""
+        self._parallel, self._path = parallel, path
         self._file: TextIO | None = None
-        if parallel.rank == 0:
-            kept = _lines_up_to(path, last_step) if path.exists() else []
-            path.write_text("".join(kept))
-            self._file = path.open("a")
+        with agree(parallel, path, "write"):
+            if parallel.rank == 0:
+                kept = _lines_up_to(path, last_step) if path.exists() else []
+                path.write_text("".join(kept))
+                self._file = path.open("a")
 
     def write(self, record: dict[str, Any]) -> None:
-        """Append one record (rank 0; nothing elsewhere)."""
-        if self._file is not None:
-            self._file.write(json.dumps(record) + "\n")
-            self._file.flush()
+        """Collective. Append rank 0's record. Raises OutputError on all ranks if it cannot."""
+        with agree(self._parallel, self._path, "write"):
+            if self._file is not None:
+                self._file.write(json.dumps(record) + "\n")
+                self._file.flush()
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file. What is still unwritten after a full disk is one line at most."""
         if self._file is not None:
-            self._file.close()
+            with contextlib.suppress(OSError):
+                self._file.close()
 
 
 def _lines_up_to(path: Path, last_step: int) -> list[str]:

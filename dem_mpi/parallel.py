@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import pickle
 import sys
+import time
 import traceback
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -210,6 +211,19 @@ class Parallel:
             mine = _error_from(form)
             mine.add_note(f"raised on rank {first} of {self.size}")
         raise mine
+
+    def all_arrive(self, seconds: float) -> bool:
+        """Collective, if it can be. Whether every rank calls this within so many seconds.
+
+        After False the ranks no longer agree on their next exchange: only `abort` is left.
+        """
+        arrival = self.communicator.Ibarrier()
+        deadline = time.monotonic() + seconds
+        while not arrival.Test():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.001)
+        return True
 
     def abort(self, exit_code: int) -> None:
         """End all ranks now with this exit code."""

@@ -13,16 +13,18 @@ import numpy as np
 
 from dem_mpi import __version__, checkpoint
 from dem_mpi.bodies import FIELDS, Bodies
-from dem_mpi.errors import InputError, StoppedError
-from dem_mpi.h5files import require_space
+from dem_mpi.errors import DemError, InputError, StoppedError
+from dem_mpi.h5files import OutputLock, require_space
 from dem_mpi.metrics import PHASES, MetricsLog, Progress, closing_table, resident_memory
-from dem_mpi.output import Field, Trajectory, frame_bytes
+from dem_mpi.output import Field, Trajectory, describe, frame_bytes
 from dem_mpi.parallel import Parallel
 from dem_mpi.placement import place
 from dem_mpi.scenario import LoadedScenario, Scenario, body_count, difference, frictional
 from dem_mpi.signals import StopRequest
 from dem_mpi.simulation import Simulation, SolverFailureError, StepRecord, redistribute, start
 from dem_mpi.state import State, restore, save
+
+_PATIENCE = 5.0  # seconds that ranks wait for each other when one reports an error
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,21 @@ def run(
 
     Raises StoppedError (75) after a signal, with a checkpoint written, and whatever ended the run.
     `on_stage` is called between the stages of each checkpoint (tests end the process there).
+
+    Errors for the user are meant to come on all ranks together; files are then closed. One that
+    came on a single rank, and any other exception, leaves the files to the abort of all ranks:
+    closing them needs every rank.
     """
-    Run(parallel, loaded, options, say, on_stage).execute(stop)
+    current = Run(parallel, loaded, options, say, on_stage)
+    try:
+        current.open()
+        current.execute(stop)
+    except DemError as error:
+        if not parallel.all_arrive(_PATIENCE):
+            raise RuntimeError(f"only this rank met: {error}") from error
+        current.close()
+        raise
+    current.close()
 
 
 class Run:
@@ -65,8 +80,9 @@ class Run:
         say: Callable[[str], None],
         on_stage: Callable[[str], None],
     ) -> None:
-        """Collective. Place the bodies or read the checkpoint, and open the output."""
+        """Take what `open` and `execute` need."""
         self._started = perf_counter()
+        self._options = options
         self._parallel, self._loaded, self._say = parallel, loaded, say
         self._on_stage = on_stage
         self._scenario = loaded.scenario
@@ -75,24 +91,35 @@ class Run:
         self._stem = self._path.stem
         self._fields = trajectory_fields(loaded.scenario)
         self._bodies = body_count(loaded.scenario)
-        state, resumed = self._initial_state(options)
-        self._check_space(self._scenario.steps - state.step)
-        self._trajectory = self._open_trajectory(state, resumed)
-        try:
-            self._metrics = MetricsLog(
-                parallel, self._path.parent / "metrics.jsonl", state.step if resumed else -1
-            )
-            self._simulation = Simulation(parallel, self._scenario, state)
-            if not resumed:
-                self._write_frame()
-        except BaseException:
-            self._trajectory.close()
-            raise
+        self._newest: Path | None = None  # checkpoint
+        self._trajectory: Trajectory | None = None
+        self._metrics: MetricsLog | None = None
+        self._simulation: Simulation | None = None
 
     # ---- start -----------------------------------------------------------------------------
 
-    def _initial_state(self, options: RunOptions) -> tuple[State, bool]:
-        parallel = self._parallel
+    def open(self) -> None:
+        """Collective. Place the bodies or read the checkpoint, and open the output."""
+        state, resumed = self._initial_state()
+        self._check_space(self._scenario.steps - state.step)
+        self._trajectory = self._open_trajectory(state, resumed)
+        log = self._path.parent / "metrics.jsonl"
+        self._metrics = MetricsLog(self._parallel, log, state.step if resumed else -1)
+        self._simulation = Simulation(self._parallel, self._scenario, state)
+        if not resumed:
+            self._write_frame()
+
+    def close(self) -> None:
+        """Collective. Close what is open."""
+        if self._metrics is not None:
+            self._metrics.close()
+        if self._trajectory is not None:
+            self._trajectory.close()
+        if self._simulation is not None:
+            self._simulation.destroy()
+
+    def _initial_state(self) -> tuple[State, bool]:
+        parallel, options = self._parallel, self._options
         if options.resume:
             found = checkpoint.find(parallel, self._path.parent, self._stem)
             for skipped in found.skipped if found else ():
@@ -100,13 +127,15 @@ class Run:
             if found is not None:
                 state, scene = restore(parallel, found.path)
                 self._compare_scene(scene, found.path, options.force)
-                if state.reference is None:
+                if state.partition.ranks != parallel.size:
                     state = redistribute(parallel, state)
+                self._newest = found.path
                 self._say(f"resuming from {found.path.name}, step {state.step}")
                 return state, True
+            self._refuse_to_repeat()
             self._say(f"no checkpoint in {self._path.parent}: starting from the beginning")
         else:
-            self._refuse_to_replace(options.force)
+            self._refuse_to_replace()
         arrays = place(self._scenario, parallel.rank, parallel.size)
         density = [material.density for material in self._scenario.materials.values()]
         state = start(parallel, Bodies.from_arrays(arrays, density))
@@ -114,15 +143,27 @@ class Run:
         state.rotating = spinning or frictional(self._scenario)
         return state, False
 
-    def _refuse_to_replace(self, force: bool) -> None:
-        exists = self._parallel.broadcast(self._path.exists())
-        if exists and not force:
+    def _refuse_to_replace(self) -> None:
+        """Collective. Raise if a run is there already, or the checkpoints of one."""
+        present = [self._path] if self._path.exists() else []
+        present += self._path.parent.glob(f"{self._stem}.checkpoint.*.h5")
+        first = self._parallel.broadcast(present[0] if present else None)
+        if first is not None and not self._options.force:
             raise InputError(
-                f"{self._path} exists: --resume continues it, --force replaces it, "
+                f"{first} exists: --resume continues that run, --force replaces it, "
                 f"--out DIR writes elsewhere"
             )
-        if force:
-            checkpoint.remove_others(self._parallel, self._path.parent, self._stem, -1, keep=0)
+
+    def _refuse_to_repeat(self) -> None:
+        """Collective. Raise if there is nothing to resume but a finished trajectory to lose."""
+        complete = False
+        if self._parallel.rank == 0 and self._path.exists():
+            complete = describe(self._path, verify=False).complete
+        if self._parallel.broadcast(complete) and not self._options.force:
+            raise InputError(
+                f"{self._path} is complete and has no checkpoint to go on from: --force with "
+                f"--resume starts again from the beginning"
+            )
 
     def _compare_scene(self, stored: dict[str, Any], path: Path, force: bool) -> None:
         changes = difference(stored, self._loaded.effective)
@@ -162,6 +203,7 @@ class Run:
         }
         common = {"bodies": self._bodies, "compression": scenario.output.compression}
         if not resumed:
+            self._discard_checkpoints()
             return Trajectory.create(self._parallel, self._path, self._fields, attributes, **common)
         trajectory = Trajectory.open_for_append(
             self._parallel, self._path, self._fields, attributes, last_step=state.step, **common
@@ -170,10 +212,18 @@ class Run:
             self._say(trajectory.message)
         return trajectory
 
+    def _discard_checkpoints(self) -> None:
+        """Collective. A new run begins: no checkpoint of an earlier one may outlive its start."""
+        lock = OutputLock(self._parallel, self._path)  # not those of a run that is going on
+        try:
+            checkpoint.remove_others(self._parallel, self._path.parent, self._stem, -1, keep=0)
+        finally:
+            lock.release()
+
     # ---- the loop --------------------------------------------------------------------------
 
     def execute(self, stop: StopRequest) -> None:
-        """Collective. Step to the end, to rest, or to a stop; leave all files closed."""
+        """Collective. Step to the end, to rest, or to a stop."""
         simulation, state = self._simulation, self._simulation.state
         progress = Progress(self._parallel, state.step, self._scenario.steps, state.flagged)
         try:
@@ -184,19 +234,17 @@ class Run:
                 progress.show(asdict(record), self._scenario.time.end, state.flagged)
                 if self._parallel.any(stop.requested):
                     self._stop(progress, stop)
-            progress.finish()
-            self._save()
-            self._trajectory.seal({"steps": state.step, "flagged_steps": state.flagged})
-            self._report()
         except SolverFailureError as error:
             progress.finish()
             if error.intact:
                 self._say(f"state before the failed step kept in {self._save().name}")
+            elif self._newest is not None:
+                self._say(f"the newest checkpoint is {self._newest.name}")
             raise
-        finally:
-            self._metrics.close()
-            self._trajectory.close()
-            simulation.destroy()
+        progress.finish()
+        self._save()
+        self._trajectory.seal({"steps": state.step, "flagged_steps": state.flagged})
+        self._report()
 
     def _stop(self, progress: Progress, stop: StopRequest) -> None:
         """Collective. Save and raise StoppedError."""
@@ -252,16 +300,19 @@ class Run:
     def _save(self) -> Path:
         """Collective. Checkpoint; the frames before it reach the disk first."""
         self._trajectory.sync()
-        return save(
+        state = self._simulation.state
+        self._newest = save(
             self._parallel,
-            self._simulation.state,
+            state,
             self._path.parent,
             self._stem,
             self._loaded.effective,
             __version__,
             self._scenario.checkpoint.keep,
+            time=state.step * self._scenario.time.step,
             on_stage=self._on_stage,
         )
+        return self._newest
 
     def _report(self) -> None:
         state = self._simulation.state

@@ -54,9 +54,10 @@ def save(
     effective: dict[str, Any],
     version: str,
     keep: int,
+    time: float,
     **options: Any,
 ) -> Path:
-    """Collective. Write the state as a checkpoint and return its path."""
+    """Collective. Write the state at `time` [s] as a checkpoint and return its path."""
     bodies = dict(state.bodies.arrays())
     bodies["impulse_count"] = np.diff(state.memory.offsets)
     reference = state.reference
@@ -73,6 +74,7 @@ def save(
     attributes = {
         "scene": json.dumps(effective),
         "version": version,
+        "time": time,
         "edge": partition.edge,
         "memory_step": state.memory_step,
         "lipschitz": state.lipschitz,
