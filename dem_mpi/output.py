@@ -35,12 +35,15 @@ from dem_mpi.h5files import (
     OutputLock,
     SharedFile,
     agree,
+    attributes_checksum,
     checksum,
     dataset_checksum,
     lock_holder,
     open_checked,
     plain,
+    read_attribute,
     read_attributes,
+    readable_size,
     reason,
     require_space,
     row_blocks,
@@ -409,7 +412,7 @@ class Trajectory:
                     vertex_offsets=self._cells + self.frames,
                     connectivity=self._largest,
                 )
-                write_attributes(file, final)
+                _write_root_attributes(file, final)
                 _set_in_place(file, "complete", 1)
         self._file.sync()
         self._file.close()
@@ -515,15 +518,30 @@ def _lay_out(
             _create_datasets(shared, fields, chunk_rows, compression)
             _create_links(shared.file, fields)
             file, own = shared.file, {"format": FORMAT, "format_version": FORMAT_VERSION}
-            write_attributes(file, {**attributes, **own})
+            _write_root_attributes(file, {**attributes, **own})
             file.attrs["complete"] = np.int64(0)
             file["VTKHDF"].attrs["Version"] = np.array([2, 2], dtype=np.int64)
             file["VTKHDF"].attrs["Type"] = np.bytes_(b"PolyData")
             file["VTKHDF/Steps"].attrs["NSteps"] = np.int64(0)
-            file["frames"].attrs["fields"] = " ".join(f.name for f in fields)
+            write_attributes(file["frames"], {"fields": " ".join(f.name for f in fields)})
             for f in fields:
-                file[f.place].attrs["unit"] = f.unit
-            file["frames/time"].attrs["unit"] = "s"
+                write_attributes(file[f.place], {"unit": f.unit})
+            write_attributes(file["frames/time"], {"unit": "s"})
+
+
+# What changes without the others, and what is computed from them.
+_UNCHECKED_ATTRIBUTES = ("complete", "checksum")
+
+
+def _root_attributes(file: h5py.File) -> dict[str, Any]:
+    """The root attributes that the attribute `checksum` is of."""
+    attributes = read_attributes(file)
+    return {k: v for k, v in attributes.items() if k not in _UNCHECKED_ATTRIBUTES}
+
+
+def _write_root_attributes(file: h5py.File, attributes: Mapping[str, Any]) -> None:
+    write_attributes(file, attributes)
+    file.attrs["checksum"] = np.uint64(attributes_checksum(_root_attributes(file)))
 
 
 def _create_datasets(
@@ -668,8 +686,7 @@ def _copy(
         target = SharedFile(parallel, temporary, "w", libver=_LIBVER, through_root=through_root)
         try:
             chunk = source[POSITION.place].chunks[0]
-            attributes = read_attributes(source)
-            _lay_out(target, fields, attributes, chunk, compression)
+            _lay_out(target, fields, _root_attributes(source), chunk, compression)
             cells = int(np.count_nonzero(index.count))
             sizes = {
                 "frames": len(index),
@@ -680,7 +697,7 @@ def _copy(
             with agree(parallel, temporary, "extend"):
                 if target.file is not None:
                     _set_extents(target.file, fields, **sizes)
-                    _set_in_place(target.file, "complete", attributes["complete"])
+                    _set_in_place(target.file, "complete", read_attribute(source, "complete"))
                     _set_in_place(target.file["VTKHDF/Steps"], "NSteps", len(index))
             large = {f.place: index.rows for f in fields}
             large["VTKHDF/Vertices/Connectivity"] = sizes["connectivity"]
@@ -745,10 +762,10 @@ def _read_fields(path: Path, file: h5py.File) -> tuple[Field, ...]:
                 f"{path}: trajectory format {version}, this program reads {FORMAT_VERSION}"
             )
         fields = []
-        for name in str(file["frames"].attrs["fields"]).split():
+        for name in str(read_attribute(file["frames"], "fields")).split():
             dataset = file[name]
             width = dataset.shape[1] if dataset.ndim == 2 else 1
-            unit = plain(dataset.attrs["unit"])
+            unit = read_attribute(dataset, "unit")
             fields.append(Field(name, dataset.dtype.str.lstrip("<>=|"), width, unit))
     except HDF5_ERRORS as error:
         raise DataError(f"{path}: damaged: {reason(error)}") from None
@@ -759,7 +776,7 @@ def _read_index(path: Path, file: h5py.File) -> FrameIndex:
     """The complete frames, checked against their checksums and against each other."""
     fields = _read_fields(path, file)
     try:
-        frames = int(file["VTKHDF/Steps"].attrs["NSteps"])
+        frames = int(read_attribute(file["VTKHDF/Steps"], "NSteps"))
         names = ("step", "time", "count", "offset")
         sizes = {name: file["frames"][name].shape[0] for name in names}
         if not 0 <= frames <= min(sizes.values()):
@@ -825,6 +842,7 @@ class Description:
     steps: tuple[int, int] = (0, 0)  # first and last
     times: tuple[float, float] = (0.0, 0.0)  # [s]
     fields: tuple[Field, ...] = ()
+    ranks: int = 0  # that wrote a checkpoint
     version: str = ""
     scene: str = ""
     attributes: Mapping[str, Any] = field(default_factory=dict)
@@ -833,6 +851,30 @@ class Description:
     def exit_code(self) -> int:
         """0 for a valid file, 65 for another."""
         return 0 if self.valid else DataError.exit_code
+
+    def lines(self) -> list[str]:
+        """What there is to say, one fact a line."""
+        verdict = "valid" if self.valid else f"not valid: {self.reason}"
+        lines = [f"{self.path}: {self.kind}, {readable_size(self.size)}, {verdict}"]
+        if self.writer:
+            lines.append(f"  being written by {self.writer}")
+        if self.kind == "unknown" or not (self.frames or self.fields):
+            return lines
+        if self.scene or self.version:
+            lines.append(f"  scene {self.scene or '(no name)'}, by dem-mpi {self.version}")
+        fewest, most = self.bodies
+        bodies = f"{most:,}" if fewest == most else f"{fewest:,} to {most:,}"
+        if self.kind == "checkpoint":
+            ranks = f", saved by {self.ranks} ranks" if self.ranks else ""
+            lines.append(f"  step {self.steps[0]}, t = {self.times[0]:.6g} s{ranks}")
+            return [*lines, f"  {bodies} bodies"]
+        state = "complete" if self.complete else "not complete: the run goes on or was ended"
+        lines.append(f"  {self.frames:,} frames, {state}")
+        if self.frames:
+            (first, last), (start, end) = self.steps, self.times
+            lines.append(f"  steps {first} to {last}, t = {start:.6g} to {end:.6g} s")
+            lines.append(f"  {bodies} bodies")
+        return lines + [f"  {f.name} ({f.dtype}, {f.width}) [{f.unit}]" for f in self.fields]
 
 
 def describe(path: Path | str, *, verify: bool = True) -> Description:
@@ -883,6 +925,8 @@ def _describe_trajectory(
         if verify:
             _verify_frames(path, file, fields, index)
             _verify_layout(path, file, index)
+            if attributes_checksum(_root_attributes(file)) != attributes.get("checksum"):
+                raise DataError(f"{path}: checksum of the attributes does not match")
     except DataError as error:
         return replace(found, reason=str(error).removeprefix(f"{path}: "))
     return replace(found, valid=True)
@@ -933,8 +977,8 @@ def _describe_checkpoint(path: Path, found: Description) -> Description:
     if problem:
         return replace(found, reason=problem)
     with open_checked(path) as file:
-        attributes = read_attributes(file["attributes"])
-        step = int(file.attrs["step"])
+        attributes = checkpoint.read_attributes_of(file)
+        step, ranks = int(read_attribute(file, "step")), int(read_attribute(file, "ranks"))
         time = float(attributes.get("time", 0.0))
         bodies = int(file["rows/bodies"][:].sum()) if "rows/bodies" in file else 0
     return replace(
@@ -945,6 +989,7 @@ def _describe_checkpoint(path: Path, found: Description) -> Description:
         bodies=(bodies, bodies),
         steps=(step, step),
         times=(time, time),
+        ranks=ranks,
         version=str(attributes.get("version", "")),
         scene=_scene_name(attributes),
         attributes=attributes,
@@ -954,7 +999,7 @@ def _describe_checkpoint(path: Path, found: Description) -> Description:
 def _scene_name(attributes: Mapping[str, Any]) -> str:
     """The name in the effective scene, which is stored as JSON."""
     try:
-        scene = json.loads(attributes.get("scenario", "{}"))
+        scene = json.loads(attributes.get("scene", "{}"))
         return str(scene.get("name", ""))
     except (ValueError, TypeError, AttributeError, RecursionError):
         return ""
