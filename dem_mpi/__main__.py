@@ -103,7 +103,7 @@ def run_command(
         _print(f"warning: {warning}", error=True)
     set_threads(loaded.scenario.threads)
     started = perf_counter()
-    warm_up(parallel, loaded.scenario.threads)
+    warm_up(parallel, loaded.scenario.threads, (loaded.scenario.contact.operator,))
     seconds = perf_counter() - started
     if seconds > 2.0:
         _print(f"compiled kernels in {seconds:.0f} s (first run only; kept in the numba cache)")
@@ -165,7 +165,7 @@ def warmup(
 
     set_threads(threads)
     started = perf_counter()
-    warm_up(Parallel(), threads)
+    warm_up(Parallel(), threads, ("matrix_free", "assembled"))
     _print(f"kernels ready in {perf_counter() - started:.1f} s")
 
 

@@ -9,14 +9,17 @@ Both forms compute the same product; the matrix-free one moves a tenth of the by
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
-
-from petsc4py import PETSc
 
 from dem_mpi import _kernels_solver as kernels
 from dem_mpi.contacts import ContactSet
 from dem_mpi.parallel import Halo, Parallel
+
+if TYPE_CHECKING:
+    from petsc4py import PETSc
 
 
 class MatrixFree:
@@ -100,6 +103,10 @@ class Assembled:
         frictional: bool,
         parallel: Parallel,
     ) -> None:
+        # Loaded here: a scene that needs no matrices does not pay for PETSc's start and memory.
+        from petsc4py import PETSc
+
+        self._petsc = PETSc
         self.contacts = contacts
         self.columns = 3 if frictional else 1
         self._dof = 6 if frictional else 3
@@ -110,11 +117,11 @@ class Assembled:
         columns = np.zeros(inverse_mass.shape[0], dtype=np.int64)
         columns[:owned] = first + np.arange(owned)
         halo.forward(columns)
-        self._body_columns = (columns * self._dof).astype(PETSc.IntType)
+        self._body_columns = (columns * self._dof).astype(self._petsc.IntType)
         comm = parallel.communicator
         csr = self._rows(contacts)
         sizes = ((contacts.count * self.columns, None), (owned * self._dof, None))
-        self.d_transposed = PETSc.Mat().createAIJ(sizes, csr=csr, comm=comm)
+        self.d_transposed = self._petsc.Mat().createAIJ(sizes, csr=csr, comm=comm)
         self.inverse_mass = self._mass_matrix(inverse_mass, inverse_inertia, owned, first, comm)
         self._diag = np.empty((contacts.count, self.columns))
         kernels.diagonal.serial(
@@ -142,8 +149,8 @@ class Assembled:
         walls = int(np.count_nonzero(contacts.b < 0))
         a_side = 3 + 2 * 6 if dof == 6 else 3
         size = (2 * m - walls) * a_side
-        indptr = np.zeros(m * self.columns + 1, dtype=PETSc.IntType)
-        indices = np.empty(size, dtype=PETSc.IntType)
+        indptr = np.zeros(m * self.columns + 1, dtype=self._petsc.IntType)
+        indices = np.empty(size, dtype=self._petsc.IntType)
         values = np.empty(size)
         kernels.assembled_rows(
             contacts.normal, contacts.arm, contacts.a, contacts.b, dof, self._body_columns,
@@ -158,10 +165,10 @@ class Assembled:
         if dof == 6:
             entries[:, 3:] = inverse_inertia[:owned, None]
         rows = owned * dof
-        indptr = np.arange(rows + 1, dtype=PETSc.IntType)
-        indices = (first * dof + np.arange(rows)).astype(PETSc.IntType)
+        indptr = np.arange(rows + 1, dtype=self._petsc.IntType)
+        indices = (first * dof + np.arange(rows)).astype(self._petsc.IntType)
         sizes = ((rows, None), (rows, None))
-        return PETSc.Mat().createAIJ(sizes, csr=(indptr, indices, entries.ravel()), comm=comm)
+        return self._petsc.Mat().createAIJ(sizes, csr=(indptr, indices, entries.ravel()), comm=comm)
 
     def body_velocity(self, impulse: NDArray) -> NDArray:
         """Collective. u = M^-1 D impulse, (n + g, 6 or 3); ghosts current."""

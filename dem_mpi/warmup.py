@@ -11,11 +11,11 @@ from dem_mpi.parallel import Parallel
 from dem_mpi.scenario import parse_scenario
 from dem_mpi.simulation import Simulation, start
 
-# Every kernel of a run is called in two steps of this scene, once with friction, once without.
+# Every kernel of a run is called in two steps of this scene.
 _SCENE = """
 domain: {{min: [-1, -1, -1], max: [1, 1, 1]}}
 materials: {{m: {{density: 1000}}}}
-friction: {{default: {mu}}}
+friction: {{default: 0.3}}
 bodies:
   - {{material: m, count: 4, radius: 0.1,
       placement: {{jittered_grid: {{min: [0, 0, 0], max: [0.4, 0.4, 0.2]}}}}}}
@@ -39,23 +39,25 @@ def set_threads(threads: int) -> None:
     numba.set_num_threads(threads)
 
 
-def warm_up(parallel: Parallel, threads: int) -> None:
-    """Collective. Compile on rank 0, then load on the others."""
+def warm_up(
+    parallel: Parallel, threads: int, operators: tuple[str, ...] = ("matrix_free",)
+) -> None:
+    """Collective. Compile what these operators use on rank 0, then load it on the others."""
     error = None
     for turn in (True, False):
         if (parallel.rank == 0) == turn:
             try:
-                _exercise(threads)
+                _exercise(threads, operators)
             except Exception as caught:
                 error = caught
         parallel.raise_together(error)
 
 
-def _exercise(threads: int) -> None:
+def _exercise(threads: int, operators: tuple[str, ...]) -> None:
     """Run two steps of a scene of four bodies on this rank alone."""
     alone = Parallel.alone()
-    for mu, operator in ((0.3, "matrix_free"), (0.0, "matrix_free"), (0.3, "assembled")):
-        text = _SCENE.format(mu=mu, threads=threads, operator=operator)
+    for operator in operators:
+        text = _SCENE.format(threads=threads, operator=operator)
         scenario = parse_scenario(text, "warm-up").scenario
         position = np.array([[0.0, 0, 0.1], [0.2, 0, 0.1], [0, 0.2, 0.1], [0.2, 0.2, 0.1]])
         arrays = {

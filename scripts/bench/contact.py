@@ -98,7 +98,7 @@ def work(task: dict[str, Any], result: Path) -> None:
 
     parallel = Parallel()
     parallel.install_abort_hook()
-    warm_up(parallel, 1)
+    warm_up(parallel, 1, ("matrix_free", "assembled"))
     found = {"solves": solves, "iterations": thesis_iterations, "steps": steps}[task["kind"]](
         parallel, task
     )
