@@ -5,8 +5,8 @@ only then renamed; older ones are removed last. So a kill at any moment leaves t
 checkpoint as it was.
 
 Layout: `groups/<group>/<name>` the ranks' rows in rank order, `rows/<group>` (P,) how many each
-rank had, `shared/<name>` what all ranks hold alike, `attributes` numbers and texts. Every data
-set has the attribute `checksum` (see `h5files.checksum`); HDF5 checks its own structures.
+rank had, `shared/<name>` what all ranks hold alike, `attributes` numbers and texts as JSON. Every
+data set has the attribute `checksum` (see `h5files.checksum`); HDF5 checks its own structures.
 A ragged group has some rows for each row of its parent, as many as a column of the parent says.
 
 Symbols: P ranks; N rows of a group over all ranks; n the rows of one rank.
@@ -15,6 +15,7 @@ Symbols: P ranks; N rows of a group over all ranks; n the rows of one rank.
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -34,6 +35,8 @@ from dem_mpi.h5files import (
     dataset_checksum,
     fsync,
     open_checked,
+    plain,
+    read_attribute,
     read_attributes,
     reason,
     require_space,
@@ -151,7 +154,7 @@ def write(
             sums = _create(file, step, groups, rows, shared, attributes, ragged)
             file.flush()
             on_stage("created")
-            _write_rows(file, groups, rows, shared)
+            _write_rows(file, groups, rows, shared, attributes)
             on_stage("data written")
             file.sync()
         except BaseException:
@@ -222,7 +225,7 @@ def _create(
             local.append(checksum(array, first_row))
     total = parallel.sum(np.array(local, dtype=np.uint64))
     sums = dict(zip(arrays, total.tolist(), strict=True))
-    for name, array in _replicated(rows, shared).items():
+    for name, array in _replicated(rows, shared, attributes).items():
         arrays[name] = array
         sums[name] = checksum(array)
         shapes[name] = array.shape
@@ -238,7 +241,6 @@ def _create(
                     "datasets": len(arrays),
                 },
             )
-            write_attributes(file.file.create_group("attributes"), attributes)
             file.file.create_group("shared")
             for group in groups:
                 file.file.create_group(f"groups/{group}")
@@ -252,24 +254,32 @@ def _create(
     return sums
 
 
-def _replicated(rows: Mapping[str, NDArray], shared: Mapping[str, NDArray]) -> dict[str, NDArray]:
+def _replicated(
+    rows: Mapping[str, NDArray], shared: Mapping[str, NDArray], attributes: Mapping[str, Any]
+) -> dict[str, NDArray]:
     """The data sets that rank 0 writes."""
-    return {f"rows/{group}": counts for group, counts in rows.items()} | {
-        f"shared/{name}": np.atleast_1d(array) for name, array in shared.items()
+    text = json.dumps(attributes, default=plain).encode()
+    return {
+        **{f"rows/{group}": counts for group, counts in rows.items()},
+        **{f"shared/{name}": np.atleast_1d(array) for name, array in shared.items()},
+        "attributes": np.frombuffer(text, dtype=np.uint8),
     }
 
 
 def _write_rows(
-    file: SharedFile, groups: Groups, rows: Mapping[str, NDArray], shared: Mapping[str, NDArray]
+    file: SharedFile,
+    groups: Groups,
+    rows: Mapping[str, NDArray],
+    shared: Mapping[str, NDArray],
+    attributes: Mapping[str, Any],
 ) -> None:
     for group, columns in groups.items():
         if rows[group].any():
             for name, array in columns.items():
                 if all(array.shape[1:]):
                     file.write_rows(f"groups/{group}/{name}", 0, array)
-    file.write_on_root(
-        {name: (0, array) for name, array in _replicated(rows, shared).items() if array.size}
-    )
+    replicated = _replicated(rows, shared, attributes)
+    file.write_on_root({name: (0, array) for name, array in replicated.items() if array.size})
 
 
 def _sync(parallel: Parallel, path: Path) -> None:
@@ -390,8 +400,9 @@ def _partial_checksums(path: Path, rank: int, size: int) -> tuple[str, dict[str,
             for name in _datasets(file):
                 dataset = file[name]
                 rows = _share(rank, size, dataset.shape[0])
-                sums[name] = _checksum_of(path, dataset, *rows), int(dataset.attrs["checksum"])
-            if len(sums) != file.attrs["datasets"]:
+                stored = int(read_attribute(dataset, "checksum"))
+                sums[name] = _checksum_of(path, dataset, *rows), stored
+            if len(sums) != read_attribute(file, "datasets"):
                 raise DataError(f"{path}: data sets are missing")
     except DemError as error:
         return str(error).removeprefix(f"{path}: "), {}
@@ -454,9 +465,9 @@ def read(parallel: Parallel, path: Path | str) -> Checkpoint:
         _check_header(path, file)
     with contextlib.closing(file):
         with agree(parallel, path, "read", DataError):
-            ranks = int(file.attrs["ranks"])
+            ranks = int(read_attribute(file, "ranks"))
             ragged = {
-                name: (group.attrs["parent"], group.attrs["count"])
+                name: (read_attribute(group, "parent"), read_attribute(group, "count"))
                 for name, group in file["groups"].items()
                 if "parent" in group.attrs
             }
@@ -479,12 +490,17 @@ def read(parallel: Parallel, path: Path | str) -> Checkpoint:
                 groups[name] = _read_rows(file, name, start, start + mine)
         with agree(parallel, path, "read", DataError):
             shared = {
-                name: dataset[:][0] if dataset.attrs["scalar"] else dataset[:]
+                name: dataset[:][0] if read_attribute(dataset, "scalar") else dataset[:]
                 for name, dataset in file["shared"].items()
             }
-            attributes = read_attributes(file["attributes"])
-            step = int(file.attrs["step"])
+            attributes = read_attributes_of(file)
+            step = int(read_attribute(file, "step"))
     return Checkpoint(path, step, ranks, groups, shared, attributes)
+
+
+def read_attributes_of(file: h5py.File) -> dict[str, Any]:
+    """The numbers and texts of a checkpoint."""
+    return json.loads(file["attributes"][:].tobytes())
 
 
 def _own_rows(parallel: Parallel, file: h5py.File, group: str, ranks: int) -> tuple[int, int]:
