@@ -315,13 +315,17 @@ class Simulation:
         )
         self._moved += moved
         weights = 1 + np.diff(state.memory.offsets)
-        if parallel.size > 1 and imbalance(parallel, float(weights.sum())) > _IMBALANCE_LIMIT:
+        load = imbalance(parallel, float(weights.sum()))
+        # Few bodies on many ranks cannot be balanced: only ask for more than was once reached.
+        if load > max(_IMBALANCE_LIMIT, _IMBALANCE_LIMIT * state.balanced):
             partition = balance(parallel, state.bodies, weights)
             state.partition = partition
             state.bodies, state.memory, moved = migrate(
                 parallel, partition, state.bodies, state.memory
             )
             self._moved += moved
+            weights = 1 + np.diff(state.memory.offsets)
+            state.balanced = imbalance(parallel, float(weights.sum()))
 
     def forget_neighbours(self) -> None:
         """Make the next step list near pairs anew, as it does when bodies have moved far."""
@@ -400,6 +404,9 @@ class Simulation:
         overlap = float(np.max(-contacts.gap / smaller, initial=0.0))
         largest = self.parallel.max(np.array([fastest, overlap]))
         v_ref = max(h * float(np.linalg.norm(self._gravity)), float(largest[0]))
+        if v_ref == 0.0:
+            # All at rest without gravity: overlap is what moves bodies, and sets the scale.
+            v_ref = self.parallel.max(float(np.max(-b_gap, initial=0.0)))
         gamma_ref = v_ref / median_of_positive(operator.diagonal(), self.parallel)
         problem = ConeProblem(
             operator, b, contacts.friction, v_ref, gamma_ref, self.parallel, self.scenario.threads
@@ -557,7 +564,9 @@ def redistribute(parallel: Parallel, state: State) -> State:
     """Collective. A state read on another number of ranks, divided among these."""
     partition = balance(parallel, state.bodies, 1 + np.diff(state.memory.offsets))
     bodies, memory, _ = migrate(parallel, partition, state.bodies, state.memory)
-    return replace(state, bodies=bodies, memory=memory, partition=partition, reference=None)
+    return replace(
+        state, bodies=bodies, memory=memory, partition=partition, reference=None, balanced=1.0
+    )
 
 
 def _energy_balance(

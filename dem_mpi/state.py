@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ class State:
     lipschitz   : step-size constant of the last solve
     deepest     : overlap that the run started with, in radii of the smaller body
     rotating    : whether orientations change at all
+    balanced    : imbalance that the last new splitters reached
     flagged     : steps that missed their tolerance; removed : bodies that left the domain
     """
 
@@ -43,7 +44,7 @@ class State:
     flagged: int = 0
     removed: int = 0
     steps_at_rest: int = 0
-    counters: dict[str, int] = field(default_factory=dict)
+    balanced: float = 1.0
 
 
 def save(
@@ -83,7 +84,7 @@ def save(
         "flagged": state.flagged,
         "removed": state.removed,
         "steps_at_rest": state.steps_at_rest,
-        "counters": json.dumps(state.counters),
+        "balanced": state.balanced,
     }
     groups = {
         "bodies": bodies,
@@ -141,5 +142,5 @@ def _state_of(stored: checkpoint.Checkpoint, parallel: Parallel) -> State:
         flagged=int(attributes["flagged"]),
         removed=int(attributes["removed"]),
         steps_at_rest=int(attributes["steps_at_rest"]),
-        counters={k: int(v) for k, v in json.loads(attributes["counters"]).items()},
+        balanced=float(attributes["balanced"]),
     )
