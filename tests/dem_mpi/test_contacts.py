@@ -7,6 +7,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+
+from dem_mpi import _kernels_detection as kernels
+from dem_mpi import _kernels_solver as frames
+from dem_mpi.bodies import Bodies, ImpulseMemory
+from dem_mpi.contacts import Walls, recall_impulses, remember_impulses
+from dem_mpi.parallel import Parallel
+from dem_mpi.partition import Partition
+
 from contact_twins import (
     CONTACT,
     all_contacts,
@@ -20,14 +28,6 @@ from contact_twins import (
     room,
     table_of,
 )
-
-from dem_mpi import _kernels_detection as kernels
-from dem_mpi import _kernels_solver as frames
-from dem_mpi.bodies import Bodies, ImpulseMemory
-from dem_mpi.contacts import Walls, recall_impulses, remember_impulses
-from dem_mpi.parallel import Parallel
-from dem_mpi.partition import Partition
-
 from launch import ROOT, run_ranks
 
 ranks_1_2_3_8 = pytest.mark.mpi(ranks=[1, 2, 3, 8])
