@@ -1,0 +1,148 @@
+"""What `dem-mpi check` foretells, against runs."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dem_mpi.estimate import Estimate, checkpoint_bytes, estimate
+from dem_mpi.scenario import parse_scenario
+
+from launch import ROOT, run_ranks
+
+# A cubic packing whose neighbours are contacts from the first step on, three a body as in a settled
+# bed. Unlike the scenes behind the estimate it is flat, has two materials, a driven box and all
+# fields in its output.
+DENSE = """
+name: dense
+domain: {{min: [-1, -1, -1], max: [3, 3, 2]}}
+materials: {{glass: {{density: 2500}}, steel: {{density: 7800}}}}
+friction: {{default: {mu}}}
+bodies:
+  - {{material: steel, count: {count}, radius: 0.01,
+     placement: {{jittered_grid: {{min: [0, 0, 0], max: [{side}, {side}, 1], spacing: 0.02005}}}}}}
+walls:
+  - {{shape: box, material: glass, min: [0, 0, 0], max: [{side}, {side}, 1], open: [z_max],
+     motion: {{oscillation: {{amplitude: [0.001, 0, 0], frequency: 1}}}}}}
+time: {{step: 1.0e-3, end: 3.0e-3}}
+contact: {{tolerance: 1, complementarity: 1, max_iterations: 10, stop_factor: 1.0e+12}}
+output:
+  interval: 1.0e-3
+  fields: [position, velocity, angular_velocity, orientation, radius, gid, material]
+checkpoint: {{interval: 1.0e-3}}
+"""
+
+BED = """
+name: bed
+domain: {{min: [-1, -1, -1], max: [2, 2, 2]}}
+materials: {{glass: {{density: 2500}}}}
+friction: {{default: 0.3}}
+bodies:
+  - {{material: glass, count: 200, radius: 0.02,
+     placement: {{jittered_grid: {{min: [0, 0, 0], max: [0.25, 0.25, {height}], jitter: 0.5}}}}}}
+walls:
+  - {{shape: box, material: glass, min: [0, 0, 0], max: [0.25, 0.25, 1], open: [z_max]}}
+time: {{step: 2.0e-3, end: 0.6}}
+contact: {{tolerance: 5.0e-3, complementarity: 0.1, max_iterations: 200, stop_factor: 1.0e+9}}
+output: {{interval: 4.0e-2}}
+"""
+
+
+def estimate_of(text: str, ranks: int = 1) -> Estimate:
+    return estimate(parse_scenario(text, "scene.yaml").scenario, ranks)
+
+
+def run_scene(text: str, directory: Path, ranks: int) -> str:
+    """Run a scene and return what it prints."""
+    scene = directory / "scene.yaml"
+    scene.write_text(text)
+    done = run_ranks(ranks, ["-m", "dem_mpi", "run", scene, "--out", directory], timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("mu", [0.3, 0.0])
+def test_memory_of_a_rank_is_foretold_within_30_percent(tmp_path, mu, ranks):
+    # 57,600 bodies on a square base: on one rank they take half as much again as the program.
+    text = DENSE.format(mu=mu, count=60 * 60 * 16, side=60 * 0.02005)
+    foretold = estimate_of(text, ranks)
+    alone = estimate_of(DENSE.format(mu=mu, count=1, side=0.1))
+    assert foretold.memory > 1.15 * alone.memory
+    printed = run_scene(text, tmp_path, ranks)
+    peak = int(re.search(r"peak memory per rank (\d+) MiB", printed)[1]) * 2**20
+    assert foretold.memory == pytest.approx(peak, rel=0.30)
+    # The program itself is most of it; the part that grows with the scene must be right as well.
+    assert foretold.memory - alone.memory == pytest.approx(peak - alone.memory, rel=0.35)
+
+
+def test_contacts_and_files_of_a_settled_bed_are_foretold(tmp_path):
+    text = BED.format(height=0.5)
+    foretold = estimate_of(text)
+    run_scene(text, tmp_path, 1)
+    last = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[-1])
+    # Rules of thumb for a bed of seven layers; an unsettled cloud has a tenth of it.
+    assert foretold.contacts == pytest.approx(last["contacts"], rel=0.2)
+    assert foretold.steps == last["step"]
+    trajectory = (tmp_path / "run.h5").stat().st_size
+    assert foretold.trajectory == pytest.approx(trajectory, rel=0.1)
+    stored = [path.stat().st_size for path in sorted(tmp_path.glob("run.checkpoint.*.h5"))]
+    assert len(stored) == foretold.checkpoints
+    assert checkpoint_bytes(200, last["contacts"]) == pytest.approx(stored[-1], rel=0.1)
+
+
+def test_more_friction_means_fewer_contacts_and_a_wider_margin_more():
+    text = BED.format(height=0.5)
+    rough = text.replace("default: 0.3", "default: 1.0")
+    wide = text.replace("tolerance: 5.0e-3", "margin: 0.1, tolerance: 5.0e-3")
+    assert estimate_of(rough).contacts < estimate_of(text).contacts < estimate_of(wide).contacts
+
+
+def test_bodies_alone_on_a_floor_have_one_contact_each():
+    text = BED.format(height=0.04).replace("0.25, 0.25", "1.9, 1.9")
+    spread = estimate_of(text)
+    # A tenth of a layer: the floor and hardly any neighbour.
+    assert spread.contacts == pytest.approx(200, rel=0.05)
+
+
+def test_bodies_without_gravity_or_floor_do_not_settle():
+    text = BED.format(height=0.5)
+    assert estimate_of(text).settled
+    assert not estimate_of(text + "gravity: [0, 0, 0]\n").settled
+    assert not estimate_of(text + "gravity: [0, 0, 9.81]\n").settled  # out through the open face
+
+
+def test_memory_falls_with_the_ranks_to_that_of_the_program():
+    text = DENSE.format(mu=0.3, count=60 * 60 * 16, side=60 * 0.02005)
+    memory = [estimate_of(text, ranks).memory for ranks in (1, 2, 8, 64)]
+    alone = estimate_of(DENSE.format(mu=0.3, count=1, side=0.1)).memory
+    assert memory == sorted(memory, reverse=True)
+    assert memory[-1] == pytest.approx(alone, rel=0.05)
+
+
+def test_more_ranks_than_bodies_is_said():
+    text = DENSE.format(mu=0.3, count=1, side=0.1)
+    assert any("3 of 4 ranks" in line for line in estimate_of(text, 4).lines())
+
+
+def test_check_starts_neither_mpi_nor_hdf5(tmp_path):
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(BED.format(height=0.5))
+    program = f"""
+import sys
+from dem_mpi.__main__ import app
+app(["check", {str(scene)!r}, "--ranks", "2"], standalone_mode=False)
+print([name for name in ("mpi4py", "petsc4py", "h5py") if name in sys.modules])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    *said, loaded = done.stdout.splitlines()
+    assert loaded == "[]"
+    assert any(re.match(r"memory +about \d+ MiB a rank on 2 ranks", line) for line in said)
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.yaml"}
