@@ -6,7 +6,8 @@ checkpoint as it was.
 
 Layout: `groups/<group>/<name>` the ranks' rows in rank order, `rows/<group>` (P,) how many each
 rank had, `shared/<name>` what all ranks hold alike, `attributes` numbers and texts as JSON. Every
-data set has the attribute `checksum` (see `h5files.checksum`); HDF5 checks its own structures.
+data set has the attribute `checksum` (see `h5files.checksum`); a seal behind the file, which is
+looked at first, vouches for the rest (see `seal`).
 A ragged group has some rows for each row of its parent, as many as a column of the parent says.
 
 Symbols: P ranks; N rows of a group over all ranks; n the rows of one rank.
@@ -43,6 +44,7 @@ from dem_mpi.h5files import (
     write_attributes,
 )
 from dem_mpi.parallel import Parallel
+from dem_mpi.seal import check_seal, write_seal
 
 FORMAT = "dem-mpi checkpoint"
 FORMAT_VERSION = 1
@@ -161,7 +163,7 @@ def write(
             file.abandon()
             raise
         file.close()
-        _sync(parallel, temporary)
+        _seal(parallel, temporary)
         on_stage("flushed")
         _read_back(parallel, temporary, sums)
         on_stage("verified")
@@ -282,7 +284,10 @@ def _write_rows(
     file.write_on_root({name: (0, array) for name, array in replicated.items() if array.size})
 
 
-def _sync(parallel: Parallel, path: Path) -> None:
+def _seal(parallel: Parallel, path: Path) -> None:
+    with agree(parallel, path, "write"):
+        if parallel.rank == 0:
+            write_seal(path)
     with agree(parallel, path, "write"):
         fsync(path)
 
@@ -395,8 +400,11 @@ def _partial_checksums(path: Path, rank: int, size: int) -> tuple[str, dict[str,
     """A fault, and by data set the checksum of one rank's rows and the one stored for all."""
     sums: dict[str, tuple[int, int]] = {}
     try:
+        sealed = path.is_file() and check_seal(path)
         with open_checked(path) as file:
             _check_header(path, file)
+            if not sealed:
+                raise DataError(f"{path}: the seal at its end is missing")
             for name in _datasets(file):
                 dataset = file[name]
                 rows = _share(rank, size, dataset.shape[0])

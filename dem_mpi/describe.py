@@ -25,6 +25,7 @@ from dem_mpi.h5files import (
     reason,
     row_blocks,
 )
+from dem_mpi.seal import check_seal
 from dem_mpi.trajectory import (
     FORMAT,
     TOPOLOGIES,
@@ -98,6 +99,8 @@ def describe(path: Path | str, *, verify: bool = True) -> Description:
     size = path.stat().st_size if path.is_file() else 0
     found = Description(path, "unknown", False, "", size, writer=lock_holder(path))
     try:
+        if path.is_file():
+            check_seal(path)
         with open_checked(path) as file:
             kind = read_attributes(file).get("format")
             if kind == FORMAT:
