@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +46,8 @@ def load(
     nobody = {
         "material": "m",
         "count": 1,
-        "radius": 1.0,
-        "placement": {"jittered_grid": {"min": [-500, -500, 1], "max": [500, 500, 500]}},
+        "radius": 1e-6,
+        "placement": {"jittered_grid": {"min": [-1e-3, -1e-3, 1e-3], "max": [1e-3, 1e-3, 3e-3]}},
     }
     scene = {
         "domain": domain or {"min": [-1e3, -1e3, -1e3], "max": [1e3, 1e3, 1e3]},
@@ -162,3 +163,26 @@ def watch(simulation: Simulation) -> RecordingSolver:
 def observed_order(steps: Sequence[float], errors: Sequence[float]) -> float:
     """Least-squares slope of log(error) over log(step)."""
     return float(np.polyfit(np.log(steps), np.log(np.abs(errors)), 1)[0])
+
+
+class StubbornSolver:
+    """Calls the first `failures` of its solves failed, whatever they achieved."""
+
+    def __init__(self, solver: Any, failures: int, dual: float | None = None) -> None:
+        self._solver, self._left, self._dual = solver, failures, dual
+
+    def solve(self, problem: ConeProblem, guess: NDArray, lipschitz: float | None) -> SolveReport:
+        """Solve, and deny success; `dual` replaces the residual [m/s] where it is given."""
+        report = self._solver.solve(problem, guess, lipschitz)
+        if self._left <= 0:
+            return report
+        self._left -= 1
+        residuals = report.residuals
+        if self._dual is not None:
+            residuals = replace(residuals, dual=self._dual)
+        return replace(report, converged=False, reason="told to fail", residuals=residuals)
+
+
+def make_fail(simulation: Simulation, failures: int, dual: float | None = None) -> None:
+    """Let the next solves of a simulation fail."""
+    simulation._solver = StubbornSolver(simulation._solver, failures, dual)

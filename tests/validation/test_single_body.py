@@ -2,9 +2,9 @@
 
 The cone complementarity problem (CCP) is a convex relaxation of Coulomb's law: where a contact
 slips with speed s it separates with speed mu s. A sliding sphere of gap phi therefore obeys
-v_z+ = mu s+ - phi/h, so that its next gap is h mu s+: it hovers h mu s above the plane. Hence, while
-it slides, the impulses add up to v_x + mu v_z = v_x0 + (g_x - mu |g_z|) t *exactly*, with v_z =
-mu (s+ - s), of first order in h.
+v_z+ = mu s+ - phi/h, so that its next gap is h mu s+: it hovers h mu s above the plane. Hence,
+while it slides, its impulses add up to v_x + mu v_z = v_x0 + (g_x - mu |g_z|) t *exactly*, with
+v_z = mu (s+ - s), of first order in h.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import pytest
 
 from dem_mpi.scenario import Scenario
 from dem_mpi.simulation import Simulation
+
 from scenes import FLOOR, observed_order, scene, simulation_of
 
 EPS = np.finfo(float).eps
