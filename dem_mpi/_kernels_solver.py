@@ -189,8 +189,20 @@ def diagonal(arm, a, b, inverse_mass, inverse_inertia, diag):
 
 
 @jit
+def _positive(x):
+    """max(0, x), but NaN where x is: max() may drop it."""
+    return 0.0 if x < 0.0 else x
+
+
+@jit
+def _larger(x, y):
+    """The larger of two numbers; NaN if either is, which max() and a plain comparison drop."""
+    return y if y > x or y != y else x
+
+
+@jit
 def _project(gn, g1, g2, mu):
-    """Project on {|gamma_t| <= mu gamma_n}."""
+    """Project on {|gamma_t| <= mu gamma_n}; NaN is kept."""
     t = np.sqrt(g1 * g1 + g2 * g2)
     if gn >= 0.0 and t <= mu * gn:
         return gn, g1, g2
@@ -206,7 +218,7 @@ def project(gamma, mu):
     """Project each row on its cone, in place (one column: on the half-line gamma_n >= 0)."""
     for i in prange(gamma.shape[0]):
         if gamma.shape[1] == 1:
-            gamma[i, 0] = max(0.0, gamma[i, 0])
+            gamma[i, 0] = _positive(gamma[i, 0])
         else:
             gamma[i, 0], gamma[i, 1], gamma[i, 2] = _project(
                 gamma[i, 0], gamma[i, 1], gamma[i, 2], mu[i]
@@ -233,7 +245,7 @@ def gradient_step(gamma, gamma_old, g, g_old, beta, step, s, mu, gamma_new, d, p
             sn = s[i, 0]
             zn = yn - step * sn * gn
             if rows == 1:
-                zn = max(0.0, zn)
+                zn = _positive(zn)
             else:
                 st = s[i, 1]
                 y1 = gamma[i, 1] + beta * (gamma[i, 1] - gamma_old[i, 1])
@@ -303,12 +315,8 @@ def curvature(g, g_old, beta, d, n_d, b, gamma_new, g_new, mu, partial):
                 push += gamma_new[i, 1] * b[i, 1] + gamma_new[i, 2] * b[i, 2]
                 slip = mu[i] * np.sqrt(g1 * g1 + g2 * g2)
             objective += 0.5 * (work + push)
-            # Written so that NaN is kept, not dropped.
-            violation = slip - gn
-            if not violation <= dual:
-                dual = violation
-            if not abs(work) <= complementarity:
-                complementarity = abs(work)
+            dual = _larger(dual, slip - gn)
+            complementarity = _larger(complementarity, abs(work))
         partial[chunk, 0] = bend
         partial[chunk, 1] = objective
         partial[chunk, 2] = dual
@@ -317,10 +325,8 @@ def curvature(g, g_old, beta, d, n_d, b, gamma_new, g_new, mu, partial):
     for chunk in range(chunks):
         bend += partial[chunk, 0]
         objective += partial[chunk, 1]
-        if not partial[chunk, 2] <= dual:
-            dual = partial[chunk, 2]
-        if not partial[chunk, 3] <= complementarity:
-            complementarity = partial[chunk, 3]
+        dual = _larger(dual, partial[chunk, 2])
+        complementarity = _larger(complementarity, partial[chunk, 3])
     return bend, objective, dual, complementarity
 
 
@@ -342,16 +348,11 @@ def residuals(gamma, g, b, mu):
             push += gamma[i, 1] * b[i, 1] + gamma[i, 2] * b[i, 2]
             t = np.sqrt(gamma[i, 1] ** 2 + gamma[i, 2] ** 2)
             slip = np.sqrt(g[i, 1] ** 2 + g[i, 2] ** 2)
-        for_primal = max(t - mu[i] * zn, -zn)
-        if not for_primal <= primal:
-            primal = for_primal
-        violation = mu[i] * slip - gn
-        if not violation <= dual:
-            dual = violation
-        if not abs(work) <= complementarity:
-            complementarity = abs(work)
+        primal = _larger(primal, _larger(t - mu[i] * zn, -zn))
+        dual = _larger(dual, mu[i] * slip - gn)
+        complementarity = _larger(complementarity, abs(work))
         if mu[i] > 0.0:
-            thesis_dual = max(thesis_dual, slip - gn / mu[i])
+            thesis_dual = _larger(thesis_dual, slip - gn / mu[i])
         thesis_sum += work
         objective += 0.5 * (work + push)
     return primal, dual, complementarity, objective, thesis_dual, thesis_sum

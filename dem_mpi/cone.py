@@ -102,13 +102,16 @@ class Tolerance:
 
 
 def evaluate(problem: ConeProblem, impulse: NDArray, velocity: NDArray) -> Residuals:
-    """Collective. Residuals of an impulse whose g = N gamma + b is `velocity`."""
+    """Collective. Residuals of an impulse whose g = N gamma + b is `velocity`.
+
+    Where a value on any rank is not a number the largest violations are infinite, on all ranks.
+    """
     primal, dual, work, objective, thesis_dual, thesis_sum = kernels.residuals(
         impulse, velocity, problem.b, problem.mu
     )
     largest = np.array([primal, dual, work, thesis_dual])
     total = np.array([objective, thesis_sum, float(problem.contacts)])
-    problem.parallel.max_in_place(largest)
+    largest_of_ranks(largest, problem.parallel)
     problem.parallel.sum_in_place(total)
     thesis_work = abs(total[1]) / max(total[2], 1.0)
     return Residuals(
@@ -118,6 +121,15 @@ def evaluate(problem: ConeProblem, impulse: NDArray, velocity: NDArray) -> Resid
         objective=float(total[0]),
         thesis=float(max(largest[0], largest[3], thesis_work)),
     )
+
+
+def largest_of_ranks(violations: NDArray, parallel: Parallel) -> None:
+    """Collective. Replace violations (k,) by the largest of all ranks, NaN by infinity.
+
+    MPI leaves a maximum with NaN open: ranks could come to different answers, and wait for ever.
+    """
+    violations[np.isnan(violations)] = np.inf
+    parallel.max_in_place(violations)
 
 
 def median_of_positive(values: NDArray, parallel: Parallel) -> float:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dem_mpi import _kernels_solver as kernels
-from dem_mpi.cone import ConeProblem, Tolerance, evaluate
+from dem_mpi.cone import ConeProblem, Tolerance, evaluate, largest_of_ranks
 from dem_mpi.solvers.result import SolveReport
 
 
@@ -101,7 +101,7 @@ class Apgd:
                     break
                 L *= 2.0
             largest = np.array([dual, work])
-            parallel.max_in_place(largest)
+            largest_of_ranks(largest, parallel)
             if not (math.isfinite(bend) and np.isfinite(largest).all()):
                 reason, merit = "not a number in the iteration", math.nan
                 break

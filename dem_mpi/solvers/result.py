@@ -16,7 +16,7 @@ class SolveReport:
 
     impulse  : (m, columns) [N s], inside the cones
     velocity : (m, columns) [m/s], g = N impulse + b from a fresh product
-    history  : (k, 3) iteration, dual residual [m/s], complementarity [J], objective in column 3
+    history  : (k, 4) iteration, dual residual [m/s], complementarity [J], objective [J]
     lipschitz: last step-size constant, a starting value for the next problem of its kind
     """
 

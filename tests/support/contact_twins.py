@@ -280,7 +280,7 @@ def projected(gamma: NDArray, mu: NDArray) -> NDArray:
     result = np.empty_like(gamma)
     for i, (row, m) in enumerate(zip(gamma, mu, strict=True)):
         n, t = row[0], np.linalg.norm(row[1:])
-        if t <= m * n:
+        if n >= 0.0 and t <= m * n:
             result[i] = row
         elif m * t <= -n:
             result[i] = 0.0
