@@ -9,13 +9,14 @@ Both forms compute the same product; the matrix-free one moves a tenth of the by
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dem_mpi import _kernels_solver as kernels
 from dem_mpi.contacts import ContactSet
+from dem_mpi.errors import DemError
 from dem_mpi.parallel import Halo, Parallel
 
 if TYPE_CHECKING:
@@ -91,7 +92,8 @@ class MatrixFree:
 class Assembled:
     """D^T and M^-1 as distributed PETSc matrices; N is applied as three products.
 
-    While the contact graph stands, `refill` keeps the pattern and overwrites the values.
+    While the contact graph stands, `refill` keeps the pattern and overwrites the values. Raises
+    DemError on all ranks if the matrices are larger than PETSc's indices can number.
     """
 
     def __init__(
@@ -113,6 +115,7 @@ class Assembled:
         self._halo = halo
         self._parallel = parallel
         owned = halo.owned
+        _check_index_width(parallel, owned * self._dof, contacts.count * self.columns, PETSc)
         first = parallel.exclusive_sum(owned)
         columns = np.zeros(inverse_mass.shape[0], dtype=np.int64)
         columns[:owned] = first + np.arange(owned)
@@ -202,3 +205,14 @@ class Assembled:
         """Collective. Free every PETSc object this operator made."""
         for item in (self.d_transposed, self.inverse_mass, self._gamma, self._g, self._w, self._u):
             item.destroy()
+
+
+def _check_index_width(parallel: Parallel, columns: int, rows: int, petsc: Any) -> None:
+    """Collective. Raise DemError if the ranks' columns or rows outnumber PETSc's index type."""
+    largest = int(parallel.sum(np.array([columns, rows], dtype=np.int64)).max())
+    width = np.iinfo(petsc.IntType)
+    if largest > width.max:
+        raise DemError(
+            f"{largest} matrix rows or columns are more than PETSc's {width.bits}-bit indices can "
+            f"number: use a PETSc with 64-bit indices, or contact.operator: matrix_free"
+        )
