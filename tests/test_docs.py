@@ -1,0 +1,88 @@
+"""What the pages under docs/ say, held against the program."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import fields
+
+import pytest
+
+from launch import ROOT, run_ranks
+
+SCENE = """
+name: two
+domain: {min: [-1, -1, -1], max: [1, 1, 1]}
+materials: {glass: {density: 2500}}
+bodies:
+  - {material: glass, count: 2, radius: 0.1,
+     placement: {jittered_grid: {min: [0, 0, 0], max: [0.4, 0.4, 0.2]}}}
+walls:
+  - {shape: plane, material: glass, point: [0, 0, 0], normal: [0, 0, 1]}
+time: {step: 1.0e-3, end: 3.0e-3}
+output: {interval: 1.0e-3}
+"""
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory):
+    path = tmp_path_factory.mktemp("two")
+    (path / "scene.yaml").write_text(SCENE)
+    arguments = ["-m", "dem_mpi", "run", path / "scene.yaml", "--out", path]
+    done = run_ranks(1, arguments, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return path
+
+
+def page(name: str) -> str:
+    return (ROOT / "docs" / name).read_text()
+
+
+def keys_of_table(text: str, heading: str) -> set[str]:
+    """The names in the first column of the first table behind a heading."""
+    table = text.split(f"## {heading}\n")[1].split("\n\n## ")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    return {name for row in rows for name in re.findall(r"`([^`]+)`", row)}
+
+
+def test_h5py_example_reads_every_frame(directory):
+    (example,) = re.findall(r"```python\n(.*?)```", page("output.md"), re.DOTALL)
+    done = subprocess.run(
+        [sys.executable, "-c", example], cwd=directory, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    # The spheres lie on the plane, their centres at 0.1 m, from the first frame to the last.
+    assert lines == [f"t = 0.00{k} s: 2 bodies, centre at z = 0.1000 m" for k in range(4)]
+
+
+def test_every_column_of_metrics_is_explained(directory):
+    from dem_mpi.simulation import StepRecord
+
+    written = set(json.loads((directory / "metrics.jsonl").read_text().splitlines()[0]))
+    assert {field.name for field in fields(StepRecord)} <= written
+    assert keys_of_table(page("output.md"), "metrics.jsonl") == written
+
+
+def test_every_field_of_the_trajectory_is_explained():
+    from typing import get_args
+
+    from dem_mpi.scene_models import BodyField
+
+    assert keys_of_table(page("output.md"), "Reading run.h5 with h5py") == set(get_args(BodyField))
+
+
+def test_scene_reference_is_up_to_date():
+    script = ROOT / "scripts" / "make_scene_reference.py"
+    done = subprocess.run(
+        [sys.executable, script, "--check"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_links_between_pages_lead_somewhere():
+    for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", path.read_text()):
+            assert (path.parent / target).exists(), f"{path.name}: {target}"
