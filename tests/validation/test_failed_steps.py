@@ -17,7 +17,7 @@ from dem_mpi.solvers.apgd import Apgd
 from dem_mpi.solvers.result import SolveReport
 from dem_mpi.state import restore
 
-from scenes import FLOOR, everybody, load, make_fail, placed, scene, simulation_of
+from scenes import FLOOR, everybody, load, make_fail, scene, simulation_of
 
 R = 0.1
 H = 1e-2
@@ -186,29 +186,3 @@ def test_an_overlap_that_runs_away_stops_the_run() -> None:
     deep = simulation_of(scene(step=H, gravity=(0, 0, 0)), [[0, 0, 0], [0.05, 0, 0]], R)
     assert deep.step().overlap == pytest.approx(1.5)
     assert deep.step().overlap < 1.5
-
-
-def test_two_threads_give_the_bits_of_one() -> None:
-    """Twenty steps of 300 spheres in a box: every array equal."""
-    grid = {"min": [0, 0, 0], "max": [0.2, 0.2, 0.2], "jitter": 0.8}
-    group = {
-        "material": "m",
-        "count": 300,
-        "radius": {"uniform": [0.008, 0.012]},
-        "placement": {"jittered_grid": grid},
-        "velocity": [0, 0, -1.0],
-        "velocity_jitter": 1.0,
-    }
-    walls = [{"shape": "box", "material": "m", "min": [0, 0, 0], "max": [0.2, 0.2, 0.4]}]
-    contact = {"tolerance": 1e-3, "complementarity": 1e-2}
-    ends, parallel = [], Parallel.alone()
-    for threads in (1, 2):
-        scenario = scene(
-            step=2e-3, mu=0.3, bodies=[group], walls=walls, contact=contact, threads=threads
-        )
-        simulation = Simulation(parallel, scenario, placed(parallel, scenario))
-        contacts = sum(simulation.step().contacts for _ in range(20))
-        ends.append({**simulation.state.bodies.arrays(), "i": simulation.state.memory.impulse})
-    assert contacts > 2000
-    for name, array in ends[0].items():
-        np.testing.assert_array_equal(array, ends[1][name], err_msg=name)
