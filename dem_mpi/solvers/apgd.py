@@ -20,6 +20,10 @@ from dem_mpi import _kernels_solver as kernels
 from dem_mpi.cone import ConeProblem, Tolerance, evaluate, largest_of_ranks
 from dem_mpi.solvers.result import SolveReport
 
+# S N S has a unit diagonal, so the largest eigenvalue is at least 1. Where the iterate no longer
+# moves every step is accepted, and L would fall until 1/L is infinite.
+_SMALLEST_LIPSCHITZ = 1e-9
+
 
 @dataclass(frozen=True)
 class ApgdOptions:
@@ -49,7 +53,8 @@ class Apgd:
     ) -> SolveReport:
         """Collective. Iterate from `guess` (m, columns) [N s] until the tolerance holds.
 
-        Returns the best iterate seen, with the reason in words when it did not converge.
+        Returns the best iterate seen, with the reason in words when it did not converge. Rows of
+        the guess that are not finite start from zero.
         """
         started = perf_counter()
         options, parallel, tolerance = self.options, problem.parallel, self.options.tolerance
@@ -62,6 +67,7 @@ class Apgd:
 
         scaling = squared_scaling(problem)
         gamma = np.array(guess, dtype=np.float64, order="C")
+        gamma[~np.isfinite(gamma).all(axis=1)] = 0.0
         project(gamma, problem.mu)
         gamma_old = gamma.copy()
         g = np.empty_like(gamma)
@@ -72,6 +78,7 @@ class Apgd:
         products = 1
         theta, beta = 1.0, 0.0
         L = lipschitz if lipschitz and math.isfinite(lipschitz) else 1.0
+        L = max(L, _SMALLEST_LIPSCHITZ)
 
         first = evaluate(problem, gamma, g)
         merit = tolerance.merit(first, problem)
@@ -114,7 +121,7 @@ class Apgd:
                 theta = theta_new
             gamma_old, gamma, gamma_new = gamma, gamma_new, gamma_old
             g_old, g, g_new = g, g_new, g_old
-            L *= options.decay
+            L = max(L * options.decay, _SMALLEST_LIPSCHITZ)
 
             if tolerance.kind == "thesis":
                 merit = tolerance.merit(evaluate(problem, gamma, g), problem)
