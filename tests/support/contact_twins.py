@@ -268,7 +268,8 @@ class DenseDelassus:
     def diagonal(self) -> NDArray:
         """Return the diagonal of N, tangents averaged: an isotropic scaling keeps the cone."""
         diag = np.diag(self.matrix).reshape(-1, self.columns).copy()
-        diag[:, 1:] = diag[:, 1:].mean(axis=1, keepdims=True)
+        if self.columns == 3:
+            diag[:, 1:] = diag[:, 1:].mean(axis=1, keepdims=True)
         return diag
 
 
