@@ -71,6 +71,23 @@ def test_an_oblique_impact_that_slides_leaves_at_mu_times_its_slip() -> None:
     assert bodies.angular_velocity[0, 1] * R == pytest.approx(2.5 * mu * p, abs=1e-10)
 
 
+def test_an_oblique_impact_of_two_spheres_spins_both_alike() -> None:
+    """The same p, per reduced mass m/2: half of each change goes to either sphere, and both turn
+    at 5/4 mu p / R in one sense (arms +R and -R, impulses - and +)."""
+    mu, v_n, s0 = 0.2, -1.0, 3.0
+    scenario = scene(step=1e-3, mu=mu, gravity=WEIGHTLESS, contact=TIGHT)
+    simulation = simulation_of(
+        scenario, [[0, 0, 0], [2 * R, 0, 0]], R, velocity=[[-v_n, s0, 0], [0, 0, 0]]
+    )
+    simulation.step()
+    bodies = everybody(simulation.parallel, simulation.state)
+    p = (mu * s0 - v_n) / (1 + 3.5 * mu**2)
+    first = [-v_n - p / 2, s0 - mu * p / 2, 0]
+    np.testing.assert_allclose(bodies.velocity, [first, [p / 2, mu * p / 2, 0]], rtol=0, atol=1e-10)
+    spin = -1.25 * mu * p / R
+    np.testing.assert_allclose(bodies.angular_velocity, [[0, 0, spin]] * 2, rtol=0, atol=1e-9)
+
+
 # ---- conservation --------------------------------------------------------------------------
 
 

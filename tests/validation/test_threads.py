@@ -34,7 +34,7 @@ def test_two_threads_give_the_bits_of_one() -> None:
     for threads in (1, 2):
         set_threads(threads)
         scenario = scene(
-            step=1e-3, mu=0.3, bodies=[group], walls=walls, contact=contact, threads=threads
+            step=2e-4, mu=0.3, bodies=[group], walls=walls, contact=contact, threads=threads
         )
         simulation = Simulation(parallel, scenario, placed(parallel, scenario))
         contacts = [simulation.step().contacts for _ in range(20)]
