@@ -274,14 +274,12 @@ class Run:
     # ---- records ---------------------------------------------------------------------------
 
     def _record(self, record: StepRecord) -> None:
-        """Collective. The frame, the checkpoint and the line of metrics that this step is due."""
+        """Collective. The frame, the line of metrics and the checkpoint that this step is due."""
         timer = self._simulation.timer
         last = record.step == self._scenario.steps or self._at_rest()
         with timer.phase("record"):
             if record.step % self._scenario.output_every == 0 or last:
                 self._write_frame()
-            if record.step % self._scenario.checkpoint_every == 0 and not last:
-                self._save()
         seconds = self._parallel.max(timer.step)
         memory = self._parallel.max(resident_memory())
         line = asdict(record)
@@ -291,6 +289,10 @@ class Run:
         line["memory"] = memory
         self._metrics.write(line)
         timer.finish_step()
+        # Last, since a resumed run writes no line of metrics and no frame of a step it has saved.
+        if record.step % self._scenario.checkpoint_every == 0 and not last:
+            with timer.phase("record"):  # of the next step
+                self._save()
 
     def _write_frame(self) -> None:
         state = self._simulation.state
@@ -316,6 +318,7 @@ class Run:
 
     def _report(self) -> None:
         state = self._simulation.state
+        self._simulation.timer.finish_step()
         facts = [f"{self._trajectory.frames} frames in {self._path}"]
         if state.flagged:
             facts.append(f"{state.flagged} steps missed their tolerance and are flagged")
