@@ -35,7 +35,6 @@ app = typer.Typer(
     name="dem-mpi",
     help="Rigid bodies in frictional contact on any number of MPI ranks.",
     epilog=_EPILOG,
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
@@ -63,6 +62,9 @@ def _options(
     if version:
         _print(f"dem-mpi {__version__}")
         raise typer.Exit
+    if context.invoked_subcommand is None:
+        _print(context.get_help(), error=True)
+        raise typer.Exit(InputError.exit_code)
 
 
 @app.command("run", epilog=_EPILOG)
@@ -111,7 +113,7 @@ def run_command(
     run(parallel, loaded, options, STOP, _print)
 
 
-@app.command()
+@app.command(epilog=_EPILOG)
 def check(
     scene: Scene,
     overrides: Overrides = None,
@@ -130,7 +132,7 @@ def check(
         _print(line)
 
 
-@app.command()
+@app.command(epilog=_EPILOG)
 def schema() -> None:
     """Print the JSON schema of scene files, with units, for editors."""
     from dem_mpi.scenario import json_schema
@@ -138,11 +140,15 @@ def schema() -> None:
     _print(json.dumps(json_schema(), indent=2))
 
 
-@app.command()
+@app.command(epilog=_EPILOG)
 def info(
     file: Annotated[Path, typer.Argument(help="Trajectory or checkpoint.", metavar="FILE.h5")],
 ) -> None:
-    """Say what is in a trajectory or checkpoint, and whether it is valid (65 if not)."""
+    """Say what is in a file of a run, and whether it is valid.
+
+    FILE.h5 is a trajectory or a checkpoint; of anything else it says that (65). A run that is
+    going on may be looked at, too.
+    """
     from dem_mpi.output import describe
 
     description = describe(file)
@@ -151,7 +157,7 @@ def info(
     raise typer.Exit(description.exit_code)
 
 
-@app.command()
+@app.command(epilog=_EPILOG)
 def warmup(
     threads: Annotated[
         int, typer.Option("--threads", min=1, help="Also compile the variants for threads.")
@@ -204,13 +210,14 @@ def main() -> None:
         # Help and usage errors come before MPI knows which rank speaks.
         sys.stdout = sys.stdout if _rank() == 0 else open(os.devnull, "w")  # noqa: SIM115
     try:
-        code = app(standalone_mode=False)
+        code = app(prog_name="dem-mpi", standalone_mode=False)
     except DemError as error:
         _print(f"dem-mpi: error: {error}", error=True)
         code = error.exit_code
     except Exception as error:
         if hasattr(error, "format_message"):  # a usage error of the command line
-            _print(f"dem-mpi: error: {error.format_message()}; see dem-mpi --help", error=True)
+            text = error.format_message().rstrip(".")
+            _print(f"dem-mpi: error: {text}; see dem-mpi --help", error=True)
             code = InputError.exit_code
         else:
             raise
