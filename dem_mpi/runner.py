@@ -181,7 +181,10 @@ class Run:
         """Collective. Refuse to start what the disk cannot hold."""
         frames = steps // self._scenario.output_every + 1
         needed = frames * frame_bytes(self._fields, self._bodies)
-        needed += (self._scenario.checkpoint.keep + 1) * checkpoint_bytes(self._bodies)
+        # One more than is kept: the oldest goes only when the newest is in place.
+        saved = steps // self._scenario.checkpoint_every + 1
+        kept = min(self._scenario.checkpoint.keep + 1, saved)
+        needed += kept * checkpoint_bytes(self._bodies)
         error = None
         if self._parallel.rank == 0:
             try:
