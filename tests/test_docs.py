@@ -86,3 +86,20 @@ def test_links_between_pages_lead_somewhere():
     for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", path.read_text()):
             assert (path.parent / target).exists(), f"{path.name}: {target}"
+
+
+def test_scene_in_the_readme_is_the_shipped_one():
+    (scene,) = re.findall(r"```yaml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    shipped = (ROOT / "configs" / "quick.yaml").read_text()
+    assert scene == "name:" + shipped.split("\nname:", 1)[1]
+    assert len(scene.splitlines()) == 20
+
+
+def test_h5py_example_of_the_readme_reads_the_last_frame(directory):
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    example = example.replace("runs/quick/run.h5", "run.h5")
+    done = subprocess.run(
+        [sys.executable, "-c", example], cwd=directory, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("0.003 [[")
