@@ -79,7 +79,7 @@ def require_space(path: Path | str, needed: int) -> None:
 def readable_size(size: int) -> str:
     """A number of bytes for people: '3.2 MiB'."""
     value, unit = float(size), "B"
-    for unit in ("B", "KiB", "MiB", "GiB", "TiB", "PiB"):  # noqa: B007
+    for unit in ("B", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB"):  # noqa: B007
         if value < 1024:
             break
         value /= 1024
@@ -372,6 +372,10 @@ def write_attributes(target: Any, attributes: Mapping[str, Any]) -> None:
     changed byte can crash HDF5 1.10.
     """
     for name, value in attributes.items():
+        if name in target.attrs:
+            # h5py would write one of a random name, another on each rank, and rename it; but
+            # ranks that change a file together must make the same change.
+            del target.attrs[name]
         if isinstance(value, str):
             text = value.encode()
             kind = h5py.string_dtype("utf-8", max(1, len(text)))

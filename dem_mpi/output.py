@@ -7,9 +7,9 @@ Beside it the same data stand under plain names (hard links): `f["position"]` an
 `frames/time` [s]. The attribute NSteps of `VTKHDF/Steps` is the number of complete frames; what
 stands behind them belongs to a frame that was never finished.
 
-Data sets grow by many frames at a time. A frame then changes no structure: its rows go first, the
-number of frames last, with a flush between, so a killed run leaves whole frames. `frames/checksum`
-holds a checksum for each frame and field (see `h5files.checksum`).
+Data sets grow by many frames at a time. A frame then moves nothing in the file: its rows go first,
+the number of frames last, with a flush between, so a killed run leaves whole frames.
+`frames/checksum` holds a checksum for each frame and field (see `h5files.checksum`).
 
 Symbols: T frames; M rows of all frames; n local rows of one frame; k width of a field.
 """
@@ -46,6 +46,7 @@ from dem_mpi.trajectory import (
     FORMAT_VERSION,
     GID,
     POSITION,
+    TIMES,
     TOPOLOGIES,
     Field,
     Frame,
@@ -83,6 +84,7 @@ _LIBVER = ("v108", "v110")
 _EXTENT_FRAMES = 16
 _EXTENT_BYTES = 1 << 30
 _INDEX_CHUNK = 256  # frames
+_TIMES_CHUNK = 4096  # frames; the times alone grow with each frame, within a chunk if possible
 _STRUCTURE_BYTES = 1 << 17  # about what the structures of a new file and of an extension take
 _SMALLEST_CHUNK, _LARGEST_CHUNK = 1 << 10, 1 << 16  # rows
 _VERIFIED_ON_RESUME = _EXTENT_FRAMES
@@ -221,6 +223,7 @@ class Trajectory:
                 if file.file is not None:
                     _set_in_place(file.file, "complete", 0)
                     _set_in_place(file.file["VTKHDF/Steps"], "NSteps", len(index))
+                    _set_extent(file.file, TIMES, len(index))
             file.sync()
             return cls(file, lock, with_required(fields), index, compression)
 
@@ -256,6 +259,9 @@ class Trajectory:
         sums = self._parallel.sum(sums)
         for f in self.fields:
             self._file.write_rows(f.place, self._rows, rows[f.name])
+        with agree(self._parallel, self.path, "extend"):
+            if self._file.file is not None:
+                _set_extent(self._file.file, TIMES, self.frames + 1)
         self._file.write_on_root(self._index_rows(step, time, total, sums))
         self._file.flush()
         with agree(self._parallel, self.path, "write"):
@@ -279,7 +285,7 @@ class Trajectory:
         # Every frame adds one offset more than it has cells.
         vertex_offset = self._cells + k
         rows: dict[str, tuple[int, Any]] = {
-            "VTKHDF/Steps/Values": (k, [time]),
+            TIMES: (k, [time]),
             "VTKHDF/Steps/PartOffsets": (k, [k]),
             "VTKHDF/Steps/NumberOfParts": (k, [1]),
             "VTKHDF/Steps/PointOffsets": (k, [self._rows]),
@@ -461,6 +467,7 @@ def _create_datasets(
     for topology in TOPOLOGIES:
         shared.create_dataset(f"VTKHDF/{topology}/Connectivity", (0,), "i8", chunk_rows=chunk_rows)
     shared.create_dataset("VTKHDF/Vertices/Offsets", (0,), "i8", chunk_rows=2 * _INDEX_CHUNK)
+    shared.create_dataset(TIMES, (0,), "f8", chunk_rows=_TIMES_CHUNK)
     for name, (dtype, width) in index_datasets(fields).items():
         shape = (0,) if width == 1 else (0, width)
         shared.create_dataset(name, shape, dtype, chunk_rows=_INDEX_CHUNK)
@@ -493,9 +500,13 @@ def _set_extents(
     sizes["VTKHDF/Vertices/Offsets"] = vertex_offsets
     sizes["VTKHDF/Vertices/Connectivity"] = connectivity
     for name, size in sizes.items():
-        dataset = file[name]
-        if dataset.shape[0] != size:
-            dataset.id.set_extent((size, *dataset.shape[1:]))
+        _set_extent(file, name, size)
+
+
+def _set_extent(file: h5py.File, name: str, size: int) -> None:
+    dataset = file[name]
+    if dataset.shape[0] != size:
+        dataset.id.set_extent((size, *dataset.shape[1:]))
 
 
 # ---- going on after an interruption --------------------------------------------------------
@@ -604,13 +615,14 @@ def _copy(
             with agree(parallel, temporary, "extend"):
                 if target.file is not None:
                     _set_extents(target.file, fields, **sizes)
+                    _set_extent(target.file, TIMES, len(index))
                     _set_in_place(target.file, "complete", read_attribute(source, "complete"))
                     _set_in_place(target.file["VTKHDF/Steps"], "NSteps", len(index))
             large = {f.place: index.rows for f in fields}
             large["VTKHDF/Vertices/Connectivity"] = sizes["connectivity"]
             for name, rows in large.items():
                 _copy_rows(parallel, source, target, name, rows, chunk)
-            small = {name: len(index) for name in index_datasets(fields)}
+            small = dict.fromkeys([TIMES, *index_datasets(fields)], len(index))
             small["VTKHDF/Vertices/Offsets"] = sizes["vertex_offsets"]
             target.write_on_root({k: (0, source[k][:n]) for k, n in small.items() if n})
             target.sync()

@@ -31,6 +31,9 @@ from dem_mpi.h5files import (
 FORMAT = "dem-mpi trajectory"
 FORMAT_VERSION = 1
 
+# The times [s]. VTK reads all of them into memory for NSteps, so there may be no more than that.
+TIMES = "VTKHDF/Steps/Values"
+
 TOPOLOGIES = ("Vertices", "Lines", "Strips", "Polygons")
 
 # What changes without the others, and what is computed from them.
@@ -115,10 +118,9 @@ def frame_checksums(index: FrameIndex) -> NDArray:
 
 
 def index_datasets(fields: Sequence[Field]) -> dict[str, tuple[str, int]]:
-    """Type and width of the data sets with one row a frame."""
+    """Type and width of the data sets with one row a frame, all but the times."""
     steps = "VTKHDF/Steps"
     names: dict[str, tuple[str, int]] = {
-        f"{steps}/Values": ("f8", 1),
         f"{steps}/PartOffsets": ("i8", 1),
         f"{steps}/NumberOfParts": ("i8", 1),
         f"{steps}/PointOffsets": ("i8", 1),
@@ -144,7 +146,8 @@ def root_attributes(file: h5py.File) -> dict[str, Any]:
 
 def write_root_attributes(file: h5py.File, attributes: Mapping[str, Any]) -> None:
     write_attributes(file, attributes)
-    file.attrs["checksum"] = np.uint64(attributes_checksum(root_attributes(file)))
+    sums = {"checksum": np.uint64(attributes_checksum(root_attributes(file)))}
+    write_attributes(file, sums)
 
 
 # ---- reading -------------------------------------------------------------------------------
