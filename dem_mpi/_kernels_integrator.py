@@ -28,6 +28,19 @@ def kinetic_energy(mass, inertia, v, w):
 
 
 @jit
+def translational_energy(mass, v):
+    """Sum of m |v|^2 / 2 over bodies [J], chunk by chunk."""
+    total = 0.0
+    for start in range(0, v.shape[0], CHUNK):
+        part = 0.0
+        for i in range(start, min(v.shape[0], start + CHUNK)):
+            vv = v[i, 0] * v[i, 0] + v[i, 1] * v[i, 1] + v[i, 2] * v[i, 2]
+            part += 0.5 * mass[i] * vv
+        total += part
+    return total
+
+
+@jit
 def largest_speed(v):
     """Return the largest |v| [m/s]; NaN if any component is."""
     largest = 0.0

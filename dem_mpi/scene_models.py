@@ -280,7 +280,7 @@ class Rest(Model):
 
     max_speed: Positive = quantity("m/s", "Largest speed of any body", default=0.01)
     kinetic_speed: Positive = quantity(
-        "m/s", "Mean kinetic energy per body stays below m/2 times this squared", default=1e-3
+        "m/s", "Mean translational energy per body stays below m/2 times this squared", default=1e-3
     )
     steps: Whole = quantity("1", "Steps in a row", default=50, ge=1)
 

@@ -64,7 +64,7 @@ def _assert_all_moments_were_met(lines: list[dict], scene: str, ranks: int) -> N
         assert any(not line["converged"] for line in lines)
 
 
-@pytest.mark.mpi(ranks=[2])
+@pytest.mark.mpi(ranks=[2], timeout=30)
 def test_resuming_a_finished_run_changes_nothing(parallel, shared_path):
     simulate(parallel, LEAVING, shared_path, "time.end=0.02")
     if parallel.rank == 0:
@@ -76,7 +76,7 @@ def test_resuming_a_finished_run_changes_nothing(parallel, shared_path):
     parallel.barrier()
 
 
-@pytest.mark.mpi(ranks=[2])
+@pytest.mark.mpi(ranks=[2], timeout=30)
 def test_resuming_where_nothing_is_starts_from_the_beginning_and_says_so(parallel, shared_path):
     said = simulate(parallel, LEAVING, shared_path, "time.end=0.02", resume=True)
     assert "no checkpoint" in said[0] and "from the beginning" in said[0]
