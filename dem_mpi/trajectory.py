@@ -21,6 +21,7 @@ from dem_mpi.h5files import (
     HDF5_ERRORS,
     attributes_checksum,
     open_checked,
+    plain,
     read_attribute,
     read_attributes,
     reason,
@@ -145,9 +146,14 @@ def root_attributes(file: h5py.File) -> dict[str, Any]:
 
 
 def write_root_attributes(file: h5py.File, attributes: Mapping[str, Any]) -> None:
-    write_attributes(file, attributes)
-    sums = {"checksum": np.uint64(attributes_checksum(root_attributes(file)))}
-    write_attributes(file, sums)
+    """Add attributes and the checksum of all of them.
+
+    The checksum is of what is meant to be there, not of what reads back: through MPI-IO one rank
+    writes for all, and the others may read before it has.
+    """
+    new = {name: plain(value) for name, value in attributes.items()}
+    total = attributes_checksum({**root_attributes(file), **new})
+    write_attributes(file, {**new, "checksum": np.uint64(total)})
 
 
 # ---- reading -------------------------------------------------------------------------------
