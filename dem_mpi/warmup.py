@@ -43,6 +43,9 @@ def warm_up(
     parallel: Parallel, threads: int, operators: tuple[str, ...] = ("matrix_free",)
 ) -> None:
     """Collective. Compile what these operators use on rank 0, then load it on the others."""
+    if "assembled" in operators:
+        # PETSc starts on all ranks together: one that came alone would wait for the others.
+        import petsc4py.PETSc  # noqa: F401
     error = None
     for turn in (True, False):
         if (parallel.rank == 0) == turn:

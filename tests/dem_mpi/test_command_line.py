@@ -282,3 +282,11 @@ def test_the_console_script_is_the_same_program():
         pytest.skip("the package is not installed here")
     done = subprocess.run([script, "--version"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, f"dem-mpi {__version__}\n")
+
+
+def test_a_scene_with_assembled_matrices_runs_on_two_ranks_from_the_command_line(scene, tmp_path):
+    """PETSc starts on all ranks together, although one rank compiles the kernels first."""
+    arguments = ["-m", "dem_mpi", "run", scene, "--out", tmp_path, "--set", "time.end=0.02"]
+    done = run_ranks(2, [*arguments, "--set", "contact.operator=assembled"], timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run.h5").exists()
