@@ -263,15 +263,23 @@ def bench(quick: bool) -> tuple[list[Record], list[dict[str, Any]]]:
     sampled = measure({"kind": "iterations", "checkpoints": [str(p) for p in every]}, 2)
     for tau in THESIS_TOLERANCES:
         counts = [row["iterations"] for row in sampled if row["tau"] == tau]
+        median = statistics.median(counts)
+        # The thesis gives counts for 25,000 spheres, at an instant that it does not state.
+        rival = (
+            {}
+            if quick
+            else {
+                "rival": "S. De 2021, Table 2.1",
+                "rival_value": THESIS_ITERATIONS[tau],
+                "ratio": median / THESIS_ITERATIONS[tau],
+            }
+        )
+        params = base | {"tau": tau, "steps": len(counts), "maximum": max(counts)}
         records.append(
             Record(
-                "contact.thesis_iterations",
-                base | {"tau": tau, "steps": len(counts), "maximum": max(counts)},
-                statistics.median(counts), "1", "S. De 2021, Table 2.1",
-                THESIS_ITERATIONS[tau], statistics.median(counts) / THESIS_ITERATIONS[tau],
-                runs=len(counts), ranks=2,
+                "contact.thesis_iterations", params, median, "1", runs=len(counts), ranks=2, **rival
             )
-        )  # fmt: skip
+        )
 
     for ranks in (1, 2):
         timed = measure({"kind": "steps", "checkpoint": chosen["rest"], "steps": 7}, ranks)
