@@ -165,5 +165,12 @@ class Apgd:
 
 
 def squared_scaling(problem: ConeProblem) -> NDArray:
-    """S^2 = 1/diag(N) by column kind: the same in both tangents, so that a cone stays a cone."""
-    return 1.0 / problem.operator.diagonal()
+    """S^2 = 1/diag(N), and of both tangents the smaller, so that a cone stays a cone.
+
+    Tangents differ where bodies are not spheres, and in problems with frames of their own.
+    """
+    diagonal = problem.operator.diagonal()
+    if diagonal.shape[1] > 1:
+        diagonal = diagonal.copy()
+        diagonal[:, 1:] = diagonal[:, 1:].max(axis=1, keepdims=True)
+    return 1.0 / diagonal
