@@ -22,6 +22,7 @@ from dem_mpi import _kernels_solver as frames
 from dem_mpi.bodies import Bodies, ImpulseMemory
 from dem_mpi.parallel import Halo, Parallel
 from dem_mpi.partition import Partition, ghost_targets
+from dem_mpi.walls import Walls, velocity_at
 
 
 @dataclass(frozen=True)
@@ -40,20 +41,6 @@ class DetectionOptions:
     def largest_friction(self) -> float:
         """The largest mu of any pair of materials."""
         return float(self.friction.max(initial=0.0))
-
-
-@dataclass(frozen=True)
-class Walls:
-    """Planes at one instant; wall k has id -(k + 1) and is known to every rank.
-
-    point : (w, 3) [m]; normal : (w, 3) unit, to the side of the bodies; velocity : (w, 3) [m/s]
-    over the step; material : (w,) int32
-    """
-
-    point: NDArray
-    normal: NDArray
-    velocity: NDArray
-    material: NDArray
 
 
 @dataclass(frozen=True)
@@ -289,7 +276,8 @@ def find_contacts(
     motion = (position, n.radius, predicted, angular_velocity)
     material = (n.material, options.friction)
     pairs = (n.offset, n.neighbour)
-    wall = (walls.point, walls.normal, walls.velocity, walls.material)
+    planes = (np.ascontiguousarray(walls.geometry[:, i : i + 3]) for i in (0, 3))
+    wall = (*planes, walls.velocity, walls.material)
     rule = (step, options.margin)
     kernels.count_contacts.using(options.threads)(*motion, *material, *pairs, *wall, *rule, row)
     np.cumsum(row, out=row)
@@ -309,6 +297,23 @@ def find_contacts(
     )
     a, b, other, normal, gap, arm, friction = contacts
     return ContactSet(a, b, other, row, normal, gap, arm, friction, int(coincident.sum()))
+
+
+def contact_velocity_of_walls(
+    contacts: ContactSet, position: NDArray, walls: Walls
+) -> NDArray | None:
+    """Return the world velocity (m, 3) [m/s] of b at the contact where b is a wall.
+
+    position : (n, 3) of the owned bodies. None if no wall moves.
+    """
+    if not walls.moving:
+        return None
+    velocity = np.zeros((contacts.count, 3))
+    rows = np.flatnonzero(contacts.b < 0)
+    arm = contacts.arm[rows, :1] * contacts.normal[rows]
+    point = position[contacts.a[rows]] + arm
+    velocity[rows] = velocity_at(walls, -contacts.b[rows] - 1, point)
+    return velocity
 
 
 def recall_impulses(

@@ -15,7 +15,8 @@ import numpy as np
 
 from dem_mpi.body_file import BodyFile
 from dem_mpi.errors import InputError
-from dem_mpi.scene_models import BodyGroup, JitteredGrid, Scenario, UniformRadius
+from dem_mpi.scene_bodies import BodyGroup, JitteredGrid, UniformRadius
+from dem_mpi.scene_models import Scenario
 
 # Eight random words a body: three for the position, one for the radius, three for the velocity.
 WORDS_PER_BODY = 8

@@ -15,52 +15,15 @@ from pydantic import ValidationError
 
 from dem_mpi.body_file import BodyFile
 from dem_mpi.errors import InputError
+from dem_mpi.scene_bodies import BodyGroup
 from dem_mpi.scene_checks import doubts, violations
 from dem_mpi.scene_errors import explain, message
-from dem_mpi.scene_models import (
-    BodyGroup,
-    BoxWall,
-    Checkpoint,
-    Contact,
-    Domain,
-    Friction,
-    JitteredGrid,
-    Material,
-    Motion,
-    Output,
-    Placement,
-    PlaneWall,
-    Rest,
-    Scenario,
-    Time,
-    UniformRadius,
-    WallFaces,
-    friction_table,
-    frictional,
-    wall_faces,
-    wall_name,
-)
+from dem_mpi.scene_models import Scenario, friction_table, frictional
 from dem_mpi.yaml_reader import override, parse, read_file, show
 
 __all__ = [
-    "BodyGroup",
-    "BoxWall",
-    "Checkpoint",
-    "Contact",
-    "Domain",
-    "Friction",
-    "JitteredGrid",
     "LoadedScenario",
-    "Material",
-    "Motion",
-    "Output",
-    "Placement",
-    "PlaneWall",
-    "Rest",
     "Scenario",
-    "Time",
-    "UniformRadius",
-    "WallFaces",
     "body_count",
     "difference",
     "effective",
@@ -70,8 +33,6 @@ __all__ = [
     "load_scenario",
     "parse_scenario",
     "restore_scenario",
-    "wall_faces",
-    "wall_name",
 ]
 
 

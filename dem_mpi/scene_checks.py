@@ -16,8 +16,11 @@ from dem_mpi.placement import (
     largest_radius,
     smallest_radius,
 )
+from dem_mpi.scene_bodies import BodyGroup
 from dem_mpi.scene_errors import nearest
-from dem_mpi.scene_models import BodyGroup, Scenario, wall_faces, wall_name
+from dem_mpi.scene_models import Scenario
+from dem_mpi.scene_walls import wall_name
+from dem_mpi.walls import PLANE, wall_faces
 from dem_mpi.yaml_reader import KeyPath
 
 # Steps are counted in float64 when times are computed from them.
@@ -181,6 +184,8 @@ def _behind_walls(
     for index, extent in extents.items():
         tolerance = 1e-9 * _length(extent)
         for k, name in enumerate(faces.name):
+            if faces.kind[k] != PLANE:
+                continue
             height = (_corners(extent) - faces.point[k]) @ faces.normal[k]
             if height.min() < -tolerance:
                 straight = np.count_nonzero(faces.normal[k]) == 1
@@ -256,7 +261,8 @@ def _speed_reached(scenario: Scenario, group: BodyGroup, extent: Extent | None) 
     start = _corners(extent if extent is not None else domain)
     heights = [float((_corners(domain) @ down).max() - (start @ down).min())]
     faces = wall_faces(scenario)
-    for point, normal in zip(faces.point, faces.normal, strict=True):
+    planes = faces.kind == PLANE
+    for point, normal in zip(faces.point[planes], faces.normal[planes], strict=True):
         if normal @ down < -0.1:
             heights.append(float(((start - point) @ normal).max() / -(normal @ down)))
     fall = max(0.0, min(heights))

@@ -1,85 +1,33 @@
-"""The scene as frozen, checked models, and the plain arrays that the simulation takes from it.
+"""The scene as one frozen, checked model.
 
-SI units throughout. Every model refuses unknown keys and silent conversions: a quoted "1" is
-text, `true` is no number, and neither NaN nor infinity is a value. What one key alone, or one
-section alone, can violate is checked here; `scene_checks` holds the rules that join sections.
+What one key alone, or one section alone, can violate is checked in the models (here, and in
+`scene_bodies` and `scene_walls`); `scene_checks` holds the rules that join sections.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Literal
 
 import numpy as np
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Discriminator,
-    Field,
-    PrivateAttr,
-    Strict,
-    Tag,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
 
-Number = Annotated[float, Strict(), Field(allow_inf_nan=False)]
-Whole = Annotated[int, Strict()]
-Switch = Annotated[bool, Strict()]
-Positive = Annotated[Number, Field(gt=0)]
-NonNegative = Annotated[Number, Field(ge=0)]
-Vec3 = tuple[Number, Number, Number]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_\-]*$", max_length=64)]
-Face = Literal["x_min", "x_max", "y_min", "y_max", "z_min", "z_max"]
-FACES: tuple[Face, ...] = ("x_min", "x_max", "y_min", "y_max", "z_min", "z_max")
+from dem_mpi.scene_base import (
+    Model,
+    Name,
+    NonNegative,
+    Positive,
+    Region,
+    Switch,
+    Vec3,
+    Whole,
+    note,
+    quantity,
+)
+from dem_mpi.scene_bodies import BodyGroup, Removal
+from dem_mpi.scene_walls import Wall
+
 BodyField = Literal[
     "position", "velocity", "angular_velocity", "orientation", "radius", "gid", "material"
 ]
-
-ZERO: Vec3 = (0.0, 0.0, 0.0)
-
-
-def quantity(unit: str, text: str, **rules: Any) -> Any:
-    """A numeric field whose unit stands in the schema; `unit` "1" means dimensionless."""
-    return Field(description=f"{text} [{unit}]", json_schema_extra={"unit": unit}, **rules)
-
-
-def note(text: str, **rules: Any) -> Any:
-    """A field that has no unit: a name, a choice, a switch or a section."""
-    return Field(description=text, **rules)
-
-
-class Model(BaseModel):
-    """Base of every part of a scene: immutable, no unknown keys, numbers of moderate size."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    @field_validator("*")
-    @classmethod
-    def _moderate(cls, value: Any) -> Any:
-        """Refuse sizes whose squares and cubes would leave the range of float64."""
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, float) and number != 0 and not 1e-30 <= abs(number) <= 1e30:
-                raise ValueError("must be 0 or between 1e-30 and 1e30 in size")
-        return value
-
-
-class Region(Model):
-    """An axis-aligned region with min below max on every axis."""
-
-    min: Vec3 = quantity("m", "Lower corner x, y, z")
-    max: Vec3 = quantity("m", "Upper corner x, y, z")
-
-    @field_validator("max")
-    @classmethod
-    def _above_min(cls, upper: Vec3, info: ValidationInfo) -> Vec3:
-        for axis, low, high in zip("xyz", info.data.get("min", upper), upper, strict=True):
-            if "min" in info.data and not low < high:
-                raise ValueError(f"must be above min on every axis ({axis}: {low:g} and {high:g})")
-        return upper
 
 
 class Domain(Region):
@@ -88,6 +36,10 @@ class Domain(Region):
     on_leave: Literal["keep", "remove"] = note(
         "What happens to a body whose centre leaves the domain; either way it is counted",
         default="keep",
+    )
+    periodic: tuple[Literal["x", "y", "z"], ...] = note(
+        "Axes along which the domain repeats: a body that leaves on one side comes in on the other",
+        default=(),
     )
 
 
@@ -111,168 +63,6 @@ class Friction(Model):
         "1", "Friction coefficient of every pair not listed", default=0.0
     )
     pairs: tuple[FrictionPair, ...] = note("Pairs with their own coefficient", default=())
-
-
-class UniformRadius(Model):
-    """Radii drawn from a uniform distribution."""
-
-    uniform: tuple[Positive, Positive] = quantity("m", "Smallest and largest radius")
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if not self.uniform[0] < self.uniform[1]:
-            raise ValueError("the smallest radius must come first and be below the largest")
-        return self
-
-
-def _radius_form(value: Any) -> str:
-    if isinstance(value, (dict, UniformRadius)):
-        return "<uniform>"
-    return "<list>" if isinstance(value, (list, tuple)) else "<number>"
-
-
-Radius = Annotated[
-    Annotated[Positive, Tag("<number>")]
-    | Annotated[tuple[Positive, ...], Field(min_length=1), Tag("<list>")]
-    | Annotated[UniformRadius, Tag("<uniform>")],
-    Discriminator(_radius_form),
-]
-
-
-class JitteredGrid(Region):
-    """Cells filling a region, one body in each, shifted at random within its cell."""
-
-    jitter: NonNegative = quantity(
-        "1",
-        "Random shift as a fraction of the free play in a cell; 1 still cannot make bodies overlap",
-        default=0.0,
-        le=1,
-    )
-    spacing: Positive | None = quantity(
-        "m", "Cell size; by default the largest that holds all bodies", default=None
-    )
-
-
-class Placement(Model):
-    """Where the bodies start: a grid, or a file of positions."""
-
-    model_config = ConfigDict(
-        json_schema_extra={"oneOf": [{"required": ["jittered_grid"]}, {"required": ["file"]}]}
-    )
-
-    jittered_grid: JitteredGrid | None = note(
-        "A region filled in whole layers from the lowest z upwards; no body reaches out of it",
-        default=None,
-    )
-    file: str | None = note(
-        "CSV (header x,y,z[,radius][,vx,vy,vz][,wx,wy,wz]) or HDF5 file (.h5, .hdf5) relative to "
-        "the scene; what it states replaces the group's radius and velocities",
-        default=None,
-        min_length=1,
-        max_length=4096,
-    )
-    dataset: str | None = note(
-        "HDF5 group holding position (n,3)[, radius (n), velocity (n,3), angular_velocity (n,3)]; "
-        "by default the file's root",
-        default=None,
-        min_length=1,
-        max_length=1024,
-    )
-    _directory: Path = PrivateAttr(default=Path())
-
-    @model_validator(mode="after")
-    def _exactly_one(self, info: ValidationInfo) -> Self:
-        if (self.jittered_grid is None) == (self.file is None):
-            raise ValueError("give exactly one of jittered_grid and file")
-        if self.dataset is not None and not (self.file or "").endswith((".h5", ".hdf5")):
-            raise ValueError("dataset goes with an HDF5 file only")
-        if self.file is not None and not self.file.endswith((".csv", ".h5", ".hdf5")):
-            raise ValueError("file must end in .csv, .h5 or .hdf5")
-        self._directory = (info.context or {}).get("directory", Path())
-        return self
-
-    @property
-    def path(self) -> Path:
-        """The file of positions, seen from the process; only where `file` is given."""
-        return self._directory / (self.file or "")
-
-
-class BodyGroup(Model):
-    """Bodies that share a shape, a material and a placement."""
-
-    shape: Literal["sphere"] = note("Shape of the bodies", default="sphere")
-    material: Name = note("Name of one of the materials")
-    count: Whole | None = quantity(
-        "1",
-        "Number of bodies; with placement.file all rows by default",
-        default=None,
-        ge=1,
-        le=2**48,
-    )
-    radius: Radius | None = quantity(
-        "m",
-        "One radius, a list dealt out in turn, or {uniform: [smallest, largest]}",
-        default=None,
-    )
-    placement: Placement = note("Initial positions")
-    velocity: Vec3 = quantity("m/s", "Initial velocity x, y, z", default=ZERO)
-    angular_velocity: Vec3 = quantity("rad/s", "Initial angular velocity x, y, z", default=ZERO)
-    velocity_jitter: NonNegative = quantity(
-        "m/s", "Each velocity component is shifted uniformly within +- this", default=0.0
-    )
-
-    @model_validator(mode="after")
-    def _complete(self) -> Self:
-        if self.placement.file is None:
-            for key in ("count", "radius"):
-                if getattr(self, key) is None:
-                    raise ValueError(f"{key} is required with placement.jittered_grid")
-        return self
-
-
-class Oscillation(Model):
-    """A sinusoidal shift of a wall."""
-
-    amplitude: Vec3 = quantity("m", "Largest shift along x, y, z")
-    frequency: Positive = quantity("Hz", "Cycles per second")
-    phase: Number = quantity("rad", "Phase at time 0", default=0.0)
-
-
-class Motion(Model):
-    """How a wall moves: u(t) = velocity t + amplitude (sin(2 pi f t + phase) - sin(phase))."""
-
-    velocity: Vec3 = quantity("m/s", "Steady velocity x, y, z", default=ZERO)
-    oscillation: Oscillation | None = note("Sinusoidal shift on top", default=None)
-
-
-class PlaneWall(Model):
-    """An infinite plane."""
-
-    shape: Literal["plane"] = note("An infinite plane")
-    name: Name | None = note("Name in reports; by default wall<number>", default=None)
-    material: Name = note("Name of one of the materials")
-    point: Vec3 = quantity("m", "Any point of the plane")
-    normal: Vec3 = quantity("1", "Direction, of any length, to the side the bodies are on")
-    motion: Motion | None = note("Motion; by default at rest", default=None)
-
-    @model_validator(mode="after")
-    def _has_direction(self) -> Self:
-        if not 1e-150 < math.hypot(*self.normal) < 1e150:
-            raise ValueError("normal must have a direction, for instance [0, 0, 1]")
-        return self
-
-
-class BoxWall(Region):
-    """The inside of a box: up to six planes that face inwards."""
-
-    shape: Literal["box"] = note("The inside of an axis-aligned box")
-    name: Name | None = note("Name in reports; by default wall<number>", default=None)
-    material: Name = note("Name of one of the materials")
-    open: tuple[Face, ...] = note("Faces that are left out", default=())
-    motion: Motion | None = note("Motion; by default at rest", default=None)
-
-
-Wall = Annotated[PlaneWall | BoxWall, Field(discriminator="shape")]
 
 
 class Rest(Model):
@@ -376,7 +166,8 @@ class Scenario(Model):
     materials: dict[Name, Material] = note("Materials by name", min_length=1)
     friction: Friction = note("Friction between materials", default=Friction())
     bodies: tuple[BodyGroup, ...] = note("Groups of bodies", min_length=1)
-    walls: tuple[Wall, ...] = note("Planes and boxes, at rest or driven", default=())
+    walls: tuple[Wall, ...] = note("Surfaces that hold the bodies, at rest or driven", default=())
+    removal: tuple[Removal, ...] = note("Regions in which bodies are taken out", default=())
     time: Time = note("Time step and end")
     contact: Contact = note("Contact solve", default=Contact())
     threads: Whole = quantity("1", "Threads per rank", default=1, ge=1, le=1024)
@@ -402,75 +193,6 @@ class Scenario(Model):
         if interval is None:
             return max(1, round(self.steps / parts))
         return max(1, round(interval / self.time.step))
-
-
-@dataclass(frozen=True)
-class WallFaces:
-    """All wall faces as arrays; face k is the kinematic body with id -(k + 1).
-
-    name: w strings such as "box.z_min"; point, normal, velocity, amplitude: (w, 3) float64 in
-    m, 1 (unit length), m/s, m; material: (w,) int32; frequency, phase: (w,) float64 in Hz, rad.
-    Displacement at time t: velocity t + amplitude (sin(2 pi frequency t + phase) - sin(phase)).
-    """
-
-    name: tuple[str, ...]
-    point: np.ndarray
-    normal: np.ndarray
-    material: np.ndarray
-    velocity: np.ndarray
-    amplitude: np.ndarray
-    frequency: np.ndarray
-    phase: np.ndarray
-
-
-def wall_name(wall: PlaneWall | BoxWall, index: int) -> str:
-    """The wall's name in reports."""
-    return wall.name or f"wall{index}"
-
-
-def wall_faces(scenario: Scenario) -> WallFaces:
-    """The faces of all walls, in the order of the scene; a box gives one per closed face."""
-    materials = list(scenario.materials)
-    names: list[str] = []
-    planes: list[tuple[Vec3, Vec3]] = []
-    owners: list[PlaneWall | BoxWall] = []
-    for index, wall in enumerate(scenario.walls):
-        for suffix, point, normal in _planes(wall):
-            names.append(wall_name(wall, index) + suffix)
-            planes.append((point, normal))
-            owners.append(wall)
-    motions = [wall.motion or Motion() for wall in owners]
-    swings = [m.oscillation or Oscillation(amplitude=ZERO, frequency=1.0) for m in motions]
-    normal = _rows([normal for _, normal in planes])
-    return WallFaces(
-        name=tuple(names),
-        point=_rows([point for point, _ in planes]),
-        normal=normal / np.linalg.norm(normal, axis=1, keepdims=True),
-        material=np.array([materials.index(wall.material) for wall in owners], dtype=np.int32),
-        velocity=_rows([motion.velocity for motion in motions]),
-        amplitude=_rows([swing.amplitude for swing in swings]),
-        frequency=np.array([swing.frequency for swing in swings], dtype=np.float64),
-        phase=np.array([swing.phase for swing in swings], dtype=np.float64),
-    )
-
-
-def _planes(wall: PlaneWall | BoxWall) -> list[tuple[str, Vec3, Vec3]]:
-    """(name suffix, point, inward normal) of each face."""
-    if isinstance(wall, PlaneWall):
-        return [("", wall.point, wall.normal)]
-    faces = []
-    for index, face in enumerate(FACES):
-        if face in wall.open:
-            continue
-        axis, upper = divmod(index, 2)
-        normal = [0.0, 0.0, 0.0]
-        normal[axis] = -1.0 if upper else 1.0
-        faces.append((f".{face}", wall.max if upper else wall.min, tuple(normal)))
-    return faces
-
-
-def _rows(vectors: list[Vec3]) -> np.ndarray:
-    return np.array(vectors, dtype=np.float64).reshape(-1, 3)
 
 
 def friction_table(scenario: Scenario) -> tuple[list[str], np.ndarray]:

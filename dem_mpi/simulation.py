@@ -21,7 +21,7 @@ from dem_mpi.contacts import (
     DetectionOptions,
     Neighbours,
     Reference,
-    Walls,
+    contact_velocity_of_walls,
     find_contacts,
     find_neighbours,
     recall_impulses,
@@ -32,11 +32,11 @@ from dem_mpi.metrics import PhaseTimer
 from dem_mpi.operators import Assembled, MatrixFree
 from dem_mpi.parallel import Parallel
 from dem_mpi.partition import balance, imbalance, migrate
-from dem_mpi.scenario import Scenario, friction_table, frictional, wall_faces
+from dem_mpi.scenario import Scenario, friction_table, frictional
 from dem_mpi.solvers.apgd import Apgd, ApgdOptions
 from dem_mpi.solvers.result import SolveReport
 from dem_mpi.state import State
-from dem_mpi.walls import contact_velocity_of_walls, walls_at
+from dem_mpi.walls import Walls, wall_faces, walls_at
 
 _IMBALANCE_LIMIT = 1.15  # max/mean of bodies + contacts that asks for new splitters
 _SHORTEST_STEP = 64  # shrink_step halves a step down to h / 64
@@ -387,7 +387,7 @@ class Simulation:
         motion = np.hstack((velocity, spin)) if self.frictional else velocity
         operator.contact_velocity(motion, b)
         b_wall = None
-        wall_velocity = contact_velocity_of_walls(contacts, walls)
+        wall_velocity = contact_velocity_of_walls(contacts, self.state.bodies.position, walls)
         if wall_velocity is not None:
             b_wall = np.empty_like(b)
             kernels.to_contact.serial(contacts.normal, wall_velocity, b_wall)

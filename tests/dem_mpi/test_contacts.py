@@ -11,9 +11,10 @@ import pytest
 from dem_mpi import _kernels_detection as kernels
 from dem_mpi import _kernels_solver as frames
 from dem_mpi.bodies import Bodies, ImpulseMemory
-from dem_mpi.contacts import Walls, recall_impulses, remember_impulses
+from dem_mpi.contacts import recall_impulses, remember_impulses
 from dem_mpi.parallel import Parallel
 from dem_mpi.partition import Partition
+from dem_mpi.walls import Walls
 
 from contact_twins import (
     CONTACT,
@@ -25,6 +26,7 @@ from contact_twins import (
     distribute,
     gathered,
     measure,
+    plane_walls,
     room,
     table_of,
 )
@@ -182,7 +184,7 @@ def test_sphere_in_a_box_touches_one_plane_a_face(parallel, position, walls):
 def test_tilted_plane_gap_is_the_distance_along_its_normal(parallel):
     normal = np.array([3.0, 0.0, 4.0]) / 5.0
     point = np.array([1.0, 2.0, 3.0])
-    walls = Walls(point[None], normal[None], np.zeros((1, 3)), np.zeros(1, dtype=np.int32))
+    walls = plane_walls(point[None], normal[None], np.zeros((1, 3)), np.zeros(1, dtype=np.int32))
     centre = point + 0.101 * normal + 7.0 * np.array([-4.0, 0.0, 3.0]) / 5.0
     c = detect(parallel, cloud([centre], 0.1), detection(), STEP, walls).contacts
     assert c.count == 1

@@ -10,7 +10,8 @@ import pytest
 
 from dem_mpi.errors import DataError, InputError
 from dem_mpi.placement import grid, place
-from dem_mpi.scenario import JitteredGrid, Scenario, body_count, load_scenario, parse_scenario
+from dem_mpi.scenario import Scenario, body_count, load_scenario, parse_scenario
+from dem_mpi.scene_bodies import JitteredGrid
 
 HEAD = """\
 domain: {min: [-1, -1, -1], max: [2, 2, 2]}

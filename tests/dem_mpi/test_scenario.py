@@ -25,8 +25,8 @@ from dem_mpi.scenario import (
     load_scenario,
     parse_scenario,
     restore_scenario,
-    wall_faces,
 )
+from dem_mpi.walls import wall_faces
 from dem_mpi.yaml_reader import MAX_BYTES, parse
 
 from scene_header import read_header
@@ -160,10 +160,10 @@ def test_plane_normal_is_normalised_and_motion_is_passed_on():
     )
     faces = wall_faces(parse_scenario(SCENE, "s", [plane]).scenario)
     np.testing.assert_allclose(faces.normal, [[0, 0.6, 0.8]])
-    np.testing.assert_array_equal(faces.velocity, [[1, 0, 0]])
-    np.testing.assert_array_equal(faces.amplitude, [[0, 0, 0.1]])
-    assert faces.frequency.tolist() == [2.0]
-    assert faces.phase.tolist() == [0.0]
+    (motion,) = faces.motion
+    assert motion.velocity == (1, 0, 0)
+    assert motion.oscillation.amplitude == (0, 0, 0.1)
+    assert (motion.oscillation.frequency, motion.oscillation.phase) == (2.0, 0.0)
 
 
 def test_scene_without_walls_has_empty_faces():
@@ -206,7 +206,7 @@ def test_override_error_names_the_override_instead_of_a_line():
         ("bodies.0.count=100000", "15625 do. Lower count or enlarge"),
         ("bodies.0.density=2500", "'density' is a key of materials.<name>"),
         ("bodies.0.material=gloss", "unknown material. Did you mean 'glass'?"),
-        ("bodies.0.placement={}", "exactly one of jittered_grid and file"),
+        ("bodies.0.placement={}", "exactly one of jittered_grid, random, insertion and file"),
         ("bodies.0.placement.jittered_grid.jitter=1.1", "must be <= 1"),
         ("bodies.0.placement.jittered_grid.spacing=0.01", "at least the largest diameter, 0.02 m"),
         ("bodies.0.placement.jittered_grid.max=[1,1,0]", "above min on every axis (z: 0 and 0)"),

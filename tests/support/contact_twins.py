@@ -20,12 +20,12 @@ from dem_mpi.contacts import (
     DetectionOptions,
     Neighbours,
     Reference,
-    Walls,
     find_contacts,
     find_neighbours,
 )
 from dem_mpi.parallel import Parallel
 from dem_mpi.partition import Partition, balance, migrate
+from dem_mpi.walls import PLANE, Walls
 
 CONTACT = np.dtype(
     [
@@ -65,9 +65,20 @@ def cloud(
     return Bodies.from_arrays(arrays, np.array([1000.0, 2500.0]))
 
 
+def plane_walls(point: NDArray, normal: NDArray, velocity: NDArray, material: NDArray) -> Walls:
+    """Return planes through points (w, 3) with unit normals (w, 3) that move at velocities."""
+    count = len(point)
+    geometry = np.zeros((count, 12))
+    geometry[:, 0:3], geometry[:, 3:6] = point, normal
+    kind = np.full(count, PLANE, np.int8)
+    still = np.zeros((count, 3))
+    return Walls(kind, geometry, material, velocity, still, still)
+
+
 def no_walls() -> Walls:
     """Return walls of which there are none."""
-    return Walls(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0, np.int32))
+    none = np.zeros((0, 3))
+    return plane_walls(none, none, none, np.zeros(0, np.int32))
 
 
 def room(low: float, high: float) -> Walls:
@@ -77,7 +88,7 @@ def room(low: float, high: float) -> Walls:
     point = np.where(normal > 0.0, low, high)
     velocity = np.zeros((6, 3))
     velocity[1] = (-0.3, 0.1, 0.0)
-    return Walls(point, normal, velocity, np.arange(6, dtype=np.int32) % 2)
+    return plane_walls(point, normal, velocity, np.arange(6, dtype=np.int32) % 2)
 
 
 def detection(margin: float = 0.02, skin: float = 0.01, threads: int = 1) -> DetectionOptions:
@@ -173,9 +184,9 @@ def brute_force(bodies: Bodies, options: DetectionOptions, step: float, walls: W
     spin = _norm(b.angular_velocity) * b.radius
     parts = [np.zeros(0, dtype=CONTACT)]
     for i in range(len(b)):
-        for k in range(len(walls.point)):
-            d = b.position[i] - walls.point[k]
-            n = walls.normal[k]
+        for k in range(len(walls.kind)):
+            d = b.position[i] - walls.geometry[k, 0:3]
+            n = walls.geometry[k, 3:6]
             phi = d[0] * n[0] + d[1] * n[1] + d[2] * n[2] - b.radius[i]
             mu = options.friction[b.material[i], walls.material[k]]
             speed = _norm(b.velocity[i] - walls.velocity[k])
