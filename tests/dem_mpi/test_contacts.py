@@ -175,7 +175,7 @@ def test_sphere_in_a_box_touches_one_plane_a_face(parallel, position, walls):
     c = found.contacts
     assert c.other.tolist() == walls
     faces = room(0.0, 1.0)
-    assert np.array_equal(c.normal, -faces.normal[-c.other - 1])
+    assert np.array_equal(c.normal, -faces.geometry[-c.other - 1, 3:6])
     assert np.allclose(c.gap, 0.0, atol=1e-16)  # positions and radius are rounded
     assert np.array_equal(c.arm[:, 0], 0.1 + 0.5 * c.gap)
     assert not c.arm[:, 1].any()
