@@ -158,6 +158,65 @@ def info(
 
 
 @app.command(epilog=_EPILOG)
+def solve(
+    problem: Annotated[
+        Path, typer.Argument(help="Problem in FCLIB's HDF5 layout.", metavar="PROBLEM.h5")
+    ],
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Limit of the dual residual, see the kinds.")
+    ] = 1e-6,
+    kind: Annotated[
+        str,
+        typer.Option(
+            "--tolerance-kind",
+            metavar="scaled|absolute|thesis",
+            help="scaled: times v_ref, the largest |q_i|; absolute: in m/s; thesis: S. De's three "
+            "residuals together.",
+        ),
+    ] = "scaled",
+    complementarity: Annotated[
+        float,
+        typer.Option("--complementarity", help="Limit of |impulse . velocity| in v_ref gamma_ref."),
+    ] = 1e-6,
+    max_iterations: Annotated[
+        int, typer.Option("--max-iterations", min=0, help="Stop, not converged, after so many.")
+    ] = 100_000,
+    guess: Annotated[
+        str | None,
+        typer.Option(
+            "--guess",
+            metavar="solution|NUMBER",
+            help="Start from the stored solution or guess. [default: from zero]",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE.h5",
+            help="Write the problem with its solution in FCLIB's layout; impulses that did not "
+            "converge go in as a guess.",
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace FILE.h5 if it exists.")] = False,
+) -> None:
+    """Solve a contact problem of the FCLIB collection: mpirun -n P dem-mpi solve PROBLEM.h5.
+
+    PROBLEM.h5 is local (W, q, mu) or global (M, H, f, w, mu). Prints iterations, residuals,
+    objective and seconds, and how stored impulses compare. Ends with 0 if the tolerance holds and
+    with 70 if it does not. There is no checkpoint of a solve: a signal ends it at once.
+    """
+    from dem_mpi.parallel import Parallel
+    from dem_mpi.solve import end_on_signals, parse_options, solve_file
+
+    end_on_signals(STOP)
+    options = parse_options(tolerance, kind, complementarity, max_iterations, guess, out, force)
+    parallel = Parallel()
+    parallel.install_abort_hook()
+    raise typer.Exit(solve_file(parallel, problem, options, _print))
+
+
+@app.command(epilog=_EPILOG)
 def warmup(
     threads: Annotated[
         int, typer.Option("--threads", min=1, help="Also compile the variants for threads.")
