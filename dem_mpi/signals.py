@@ -5,6 +5,8 @@ from __future__ import annotations
 import signal
 from types import FrameType
 
+_HEEDED = (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT)
+
 
 class StopRequest:
     """Remembers that a signal asked this rank to stop.
@@ -25,16 +27,17 @@ class StopRequest:
         """Heed USR1, TERM and INT from now on; once one has come there is no more to heed."""
         if self.requested:
             return
-        for number in (signal.SIGUSR1, signal.SIGTERM, signal.SIGINT):
+        for number in _HEEDED:
             signal.signal(number, self._remember)
 
     def ignore(self) -> None:
-        """Let USR1 pass from now on.
+        """Let these signals pass from now on.
 
-        The launcher may send it until the process has ended, and Python restores the deadly
-        default while it shuts down.
+        The launcher may send USR1 until the process has ended, and srun sends TERM as soon as
+        another rank has left with 75; but Python restores the deadly default while it shuts down.
         """
-        signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+        for number in _HEEDED:
+            signal.signal(number, signal.SIG_IGN)
 
     def _remember(self, number: int, frame: FrameType | None) -> None:
         self.name = signal.Signals(number).name
