@@ -89,6 +89,10 @@ child=
 
 forward() {
     asked=$1
+    case $asked in
+        requeue) note "warned of the time limit: stopping with a checkpoint" ;;
+        end) note "asked to end: stopping with a checkpoint" ;;
+    esac
     [[ -z $child ]] || kill -USR1 "$child" 2>/dev/null
 }
 

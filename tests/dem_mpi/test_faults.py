@@ -38,6 +38,7 @@ from runs import (
     damage,
     dataset_offsets,
     differences,
+    last_step,
     messages,
     metrics,
     simulate,
@@ -97,15 +98,6 @@ def ranks_of(process: subprocess.Popen[str]) -> list[int]:
         ]
     except OSError:
         return []
-
-
-def last_step(directory: Path) -> int:
-    """The last step that metrics.jsonl tells of, while a run may be writing it."""
-    try:
-        lines = (directory / "metrics.jsonl").read_text().splitlines()
-        return json.loads(lines[-1])["step"] if lines else 0
-    except (OSError, ValueError):
-        return 0
 
 
 def run_and_kill(scene: Path, directory: Path, random: np.random.Generator, step: int) -> None:

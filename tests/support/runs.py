@@ -126,6 +126,15 @@ def metrics(directory: Path) -> list[dict[str, Any]]:
     return [{k: v for k, v in json.loads(s).items() if k not in _CLOCKS} for s in lines]
 
 
+def last_step(directory: Path) -> int:
+    """The last step that metrics.jsonl tells of, while a run may be writing it."""
+    try:
+        lines = (directory / "metrics.jsonl").read_text().splitlines()
+        return json.loads(lines[-1])["step"] if lines else 0
+    except (OSError, ValueError):
+        return 0
+
+
 def checkpoints(directory: Path) -> list[Path]:
     """The checkpoints in a directory, the newest last."""
     return sorted(directory.glob("run.checkpoint.*.h5"))
