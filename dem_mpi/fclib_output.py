@@ -68,7 +68,7 @@ def write_result(
         for name, array in vectors.items()
     }
     lock = OutputLock(parallel, out)
-    temporary = out.with_name(f"{out.name}.partial")
+    temporary = out.with_name(f"{out.name}.part")
     try:
         _write(parallel, temporary, problem, group, arrays, attributes)
         with agree(parallel, out, "rename"):
