@@ -1,0 +1,98 @@
+"""Where points stand against rectangles and frustums; rows g of walls as in `_kernels_shapes`.
+
+Symbols: P point in the world; k axis and (s, rho) meridian coordinates of a frustum, with
+(us, ur) the direction of its meridian segment and (-sin, cos) the normal away from the axis.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dem_mpi._jit import jit
+from dem_mpi._kernels_vectors import (
+    across,
+    along,
+    clamp,
+    dot,
+    neg,
+    norm,
+    scaled,
+    sub,
+    unit,
+    vec,
+)
+
+
+@jit
+def on_rectangle(P, g):
+    """Return (distance, n, clamped) from a point P to a rectangle, n towards the rectangle.
+
+    `clamped`: the foot lies on an edge or a corner. A point in the plate counts as above it.
+    """
+    m, e1, e2 = vec(g[3:6]), vec(g[6:9]), vec(g[9:12])
+    X = sub(P, vec(g[0:3]))
+    height = dot(X, m)
+    u1, u2 = dot(X, e1) / dot(e1, e1), dot(X, e2) / dot(e2, e2)
+    if abs(u1) <= 1.0 and abs(u2) <= 1.0:
+        return abs(height), (m if height < 0.0 else neg(m)), False
+    u1, u2 = clamp(u1, -1.0, 1.0), clamp(u2, -1.0, 1.0)
+    v = along(along(neg(X), u1, e1), u2, e2)
+    distance = norm(v)
+    return distance, unit(v), True
+
+
+@jit
+def frustum_frame(g):
+    """Return (length, slant, us, ur, cos, sin): the meridian segment of a frustum.
+
+    (us, ur) is its unit direction from the base and (-sin, cos) its normal away from the axis
+    (on a flat ring: along -axis), both as (s, rho).
+    """
+    L, rise = g[6], g[8] - g[7]
+    slant = np.sqrt(L * L + rise * rise)
+    if L == 0.0:
+        return L, slant, 0.0, (1.0 if rise >= 0.0 else -1.0), 0.0, 1.0
+    return L, slant, L / slant, rise / slant, L / slant, rise / slant
+
+
+@jit
+def meridian(X, k):
+    """Return (s, rho, radial) of X about the unit axis k through 0."""
+    s = dot(X, k)
+    e = along(X, -s, k)
+    rho = norm(e)
+    return s, rho, (scaled(1.0 / rho, e) if rho > 0.0 else across(k))
+
+
+@jit
+def on_frustum(P, g):
+    """Return (distance, n, clamped, height) from a point P to a frustum, n towards it.
+
+    Foot within the surface: the distance is signed, positive on the bodies' side, and n is the
+    normal of that side even behind the surface. Foot on a rim (`clamped`): unsigned. `height` is
+    the signed distance from the surface continued beyond its rims.
+    """
+    k, side = vec(g[3:6]), g[9]
+    _, slant, us, ur, cos, sin = frustum_frame(g)
+    s, rho, radial = meridian(sub(P, vec(g[0:3])), k)
+    away = along(scaled(side * cos, radial), -side * sin, k)
+    height = -side * (cos * (rho - g[7]) - sin * s)
+    f = us * s + ur * (rho - g[7])
+    if 0.0 <= f <= slant and slant > 0.0:
+        return height, away, False, height
+    f = 0.0 if f < 0.0 else slant
+    vs, vr = us * f - s, g[7] + ur * f - rho
+    distance = np.sqrt(vs * vs + vr * vr)
+    if distance == 0.0:
+        return 0.0, away, True, height
+    return distance, along(scaled(vr / distance, radial), vs / distance, k), True, height
+
+
+@jit
+def behind(clamped, height, reach):
+    """Whether a body whose centre stands so has the surface of a frustum behind it, untouched.
+
+    Next to the surface a centre is behind when deeper than the body's own reach; beyond a rim,
+    where a body may well pass to the other side, as soon as it is on the wrong side.
+    """
+    return height < (0.0 if clamped else -reach)
