@@ -15,7 +15,7 @@ The rival: linear springs (k_t = 2/7 k), tangential history, the scene's frictio
 dashpots critical in both directions, which leaves a restitution of exp(-2) where ours has none;
 time step t_c / 20 with t_c = pi sqrt(m / 2k) (at t_c / 10 the bed does not come to rest). Its
 seconds are its loop's, ours those of all phases; set-up, compilation and files are in neither.
-About half of our closed contacts rest at a gap below 1e-6 r instead of an overlap and are left out
+Over half of our closed contacts rest at a gap below 1e-5 r instead of an overlap and are left out
 of the percentile, which makes ours the larger one.
 
 Not installed? LAMMPS with its package GRANULAR goes into an environment of its own:
