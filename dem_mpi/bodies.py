@@ -33,9 +33,12 @@ class Field(NamedTuple):
 FIELDS: Mapping[str, Field] = {
     "gid": Field(np.int64, (), "1", "name for life, >= 0"),
     "material": Field(np.int32, (), "1", "row of the material table"),
-    "radius": Field(np.float64, (), "m", "radius"),
+    "shape": Field(np.int8, (), "1", "place in scene_bodies.SHAPES"),
+    "radius": Field(np.float64, (), "m", "radius, of caps or of the equator"),
+    "half_length": Field(np.float64, (), "m", "half the core or polar semi-axis; of spheres 0"),
     "mass": Field(np.float64, (), "kg", "mass"),
-    "inertia": Field(np.float64, (), "kg m^2", "moment of inertia about every axis"),
+    "inertia": Field(np.float64, (), "kg m^2", "moment of inertia across the symmetry axis"),
+    "axial_inertia": Field(np.float64, (), "kg m^2", "moment of inertia about the symmetry axis"),
     "position": Field(np.float64, (3,), "m", "centre of mass"),
     "orientation": Field(np.float64, (4,), "1", "unit quaternion, body to world"),
     "velocity": Field(np.float64, (3,), "m/s", "velocity of the centre of mass"),
@@ -53,15 +56,19 @@ _MEMORY_FIELDS: Mapping[str, Field] = {
 class Bodies:
     """The bodies a rank owns, one row each. The arrays are mutable and contiguous.
 
-    `FIELDS` gives the type, row shape and unit of every array. After a migration rows are in
+    `FIELDS` gives the type, row shape and unit of every array. The symmetry axis is the z axis
+    of the body; `shapes` says what radius and half_length are. After a migration rows are in
     order of (Morton key, gid).
     """
 
     gid: NDArray[np.int64]
     material: NDArray[np.int32]
+    shape: NDArray[np.int8]
     radius: NDArray[np.float64]
+    half_length: NDArray[np.float64]
     mass: NDArray[np.float64]
     inertia: NDArray[np.float64]
+    axial_inertia: NDArray[np.float64]
     position: NDArray[np.float64]
     orientation: NDArray[np.float64]
     velocity: NDArray[np.float64]
@@ -89,12 +96,13 @@ class Bodies:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, ArrayLike], density: ArrayLike) -> Bodies:
-        """Make homogeneous spheres from what a placement gives.
+        """Make homogeneous bodies from what a placement gives.
 
-        `arrays` must hold gid, material, radius and position and may hold orientation (identity
-        otherwise), velocity and angular_velocity (zero otherwise); `density` (materials,)
-        [kg/m³] is indexed by material. Mass and inertia follow from them. ValueError names a
-        missing or an unknown array.
+        `arrays` must hold gid, material, radius and position and may hold shape (sphere
+        otherwise) with half_length (needed by other shapes), orientation (identity otherwise),
+        velocity and angular_velocity (zero otherwise); `density` (materials,) [kg/m³] is indexed
+        by material. Mass and inertia follow from them. ValueError names a missing or an unknown
+        array.
         """
         for name in ("gid", "material", "radius", "position"):
             if name not in arrays:
@@ -102,12 +110,17 @@ class Bodies:
         for name in arrays:
             if name not in FIELDS:
                 raise ValueError(f"bodies have no field {name!r}")
-        radius = np.asarray(arrays["radius"], dtype=np.float64)
+        count = len(np.asarray(arrays["gid"]))
+        values = {**cls.empty(count).arrays(), **arrays}
+        form = [
+            _as_field(n, values[n], FIELDS[n], count) for n in ("shape", "radius", "half_length")
+        ]
+        if np.any((form[0] != shapes.SPHERE) & ~(form[2] > 0.0)):
+            raise ValueError("bodies that are not spheres need half_length")
         material = np.asarray(arrays["material"], dtype=np.int32)
-        mass = np.asarray(density, dtype=np.float64)[material] * shapes.sphere_volume(radius)
-        values = cls.empty(len(radius)).arrays()
-        derived = {"mass": mass, "inertia": shapes.sphere_inertia(mass, radius)}
-        return cls(**{**values, **arrays, **derived})
+        mass = np.asarray(density, dtype=np.float64)[material] * shapes.volume(*form)
+        transverse, axial = shapes.inertia(form[0], mass, *form[1:])
+        return cls(**{**values, "mass": mass, "inertia": transverse, "axial_inertia": axial})
 
     @classmethod
     def concatenate(cls, parts: Sequence[Bodies]) -> Bodies:
@@ -119,6 +132,16 @@ class Bodies:
     def arrays(self) -> dict[str, NDArray]:
         """Every array by name, not copied: what a checkpoint writes; `Bodies(**arrays)` reads."""
         return {name: getattr(self, name) for name in FIELDS}
+
+    @property
+    def bounding_radius(self) -> NDArray[np.float64]:
+        """Radius (n,) [m] of the sphere about the position that contains the body."""
+        return shapes.bounding_radius(self.shape, self.radius, self.half_length)
+
+    @property
+    def smallest_size(self) -> NDArray[np.float64]:
+        """Radius (n,) [m] of the largest sphere about the position inside the body."""
+        return shapes.smallest_size(self.shape, self.radius, self.half_length)
 
     def take(self, index: ArrayLike) -> Bodies:
         """Copy the rows `index` (k,), in that order."""

@@ -17,6 +17,8 @@ from dem_mpi.parallel import Parallel
 from dem_mpi.partition import Partition
 
 _RAGGED = {"impulses": ("bodies", "impulse_count")}
+# What a stored state holds; raised with every change of it. 2: bodies of several shapes.
+_LAYOUT = 2
 
 
 @dataclass
@@ -73,6 +75,7 @@ def save(
         "reference_frame": reference.frame if reference is not None else np.zeros(3),
     }
     attributes = {
+        "layout": _LAYOUT,
         "scene": json.dumps(effective),
         "version": version,
         "time": time,
@@ -104,6 +107,7 @@ def restore(parallel: Parallel, path: Path) -> tuple[State, dict[str, Any]]:
     the caller divides them anew.
     """
     stored = checkpoint.read(parallel, path)
+    _check_layout(stored, path)
     try:
         state = _state_of(stored, parallel)
         scene = json.loads(stored.attributes["scene"])
@@ -112,6 +116,17 @@ def restore(parallel: Parallel, path: Path) -> tuple[State, dict[str, Any]]:
         problem = DataError(f"{path}: not a state of this program: {error}")
     parallel.raise_together(problem)
     return state, scene
+
+
+def _check_layout(stored: checkpoint.Checkpoint, path: Path) -> None:
+    """Raise DataError, alike on all ranks, for a state stored by an older or a newer program."""
+    layout = stored.attributes.get("layout", 1)
+    if layout != _LAYOUT:
+        version = stored.attributes.get("version", "an unknown version")
+        raise DataError(
+            f"{path}: state of layout {layout}, by dem-mpi {version}; this program reads layout "
+            f"{_LAYOUT}: resume with that version, or start the run anew with --force"
+        )
 
 
 def _state_of(stored: checkpoint.Checkpoint, parallel: Parallel) -> State:
