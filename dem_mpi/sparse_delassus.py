@@ -206,10 +206,14 @@ class _DirectInverse:
         factorisation.setType(PETSc.PC.Type.CHOLESKY if symmetric else PETSc.PC.Type.LU)
         try:
             factorisation.setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
+            factorisation.setFactorSetUpSolverType()
+            self._factor = factorisation.getFactorMatrix()
+            # For the inertia: no ScaLAPACK at the root of the tree, and zero pivots counted.
+            self._factor.setMumpsIcntl(13, 1)
+            self._factor.setMumpsIcntl(24, 1)
             self._ksp.setUp()
         except PETSc.Error as error:
             raise DemError(f"{label}: cannot be factorised by PETSc with MUMPS: {error}") from None
-        self._factor = factorisation.getFactorMatrix()
         if symmetric:
             negative, zero, _ = self._factor.getInertia()
             if negative or zero:
