@@ -12,6 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from dem_mpi._jit import jit, jit_threads, prange
+from dem_mpi._kernels_walls import largest_margin, may_touch, touches
+from dem_mpi._kernels_walls import norm as _norm
 
 # Offsets of the half neighbourhood: the cell itself and 13 of its 26 neighbours.
 _HALF = np.array(
@@ -114,7 +116,8 @@ def search_pairs(
 
     offset : (N + 1,) int64; counts of body i go to offset[i + 1] when `low` is empty;
     low, high : (pairs,) int32, the body with the smaller gid first. Pairs whose `low` is a ghost
-    belong to another rank and are left out.
+    are listed where it is owned (or, a periodic image, where it is the body itself) and left out
+    here; so are a body and its own image, which move as one.
     """
     mask = np.int64(start.shape[0] - 2)
     count_only = low.shape[0] == 0
@@ -136,7 +139,7 @@ def search_pairs(
                     if entry_key[t] != key:
                         continue
                     j = np.int64(entry[t])
-                    if same and q == 0 and j <= i:
+                    if (same and q == 0 and j <= i) or gid[i] == gid[j]:
                         continue
                     a, b = (i, j) if gid[i] < gid[j] else (j, i)
                     if a >= n or not _near(x, r, s, i, j, c, skin):
@@ -150,10 +153,18 @@ def search_pairs(
 
 
 @jit
-def group_pairs(low, high, gid, n, offset, neighbour):
-    """Group pairs by their first body, in ascending gid of the second (counting + insertion sort).
+def _before(gid, image, i, j):
+    """Whether body i comes before j in the order of (gid, image)."""
+    return gid[i] < gid[j] or (gid[i] == gid[j] and image[i] < image[j])
 
+
+@jit
+def group_pairs(low, high, gid, image, n, offset, neighbour):
+    """Group pairs by their first body, ascending in (gid, image) of the second.
+
+    image  : (N,) int8 image code, which tells the periodic images of one body apart
     offset : (n + 1,) int64, zeros on entry; neighbour : (pairs,) int32.
+    Counting sort by the first, insertion sort (or, of many, merge sort) by the second.
     """
     for p in range(low.shape[0]):
         offset[low[p] + 1] += 1
@@ -167,37 +178,16 @@ def group_pairs(low, high, gid, n, offset, neighbour):
     for i in range(n):
         row = neighbour[offset[i] : offset[i + 1]]
         if row.shape[0] > 32:
-            row[:] = row[np.argsort(gid[row])]
+            row[:] = row[np.argsort(image[row], kind="mergesort")]
+            row[:] = row[np.argsort(gid[row], kind="mergesort")]
             continue
         for p in range(1, row.shape[0]):
             value = row[p]
             q = p - 1
-            while q >= 0 and gid[row[q]] > gid[value]:
+            while q >= 0 and _before(gid, image, value, row[q]):
                 row[q + 1] = row[q]
                 q -= 1
             row[q + 1] = value
-
-
-@jit
-def _norm(x, y, z):
-    return np.sqrt(x * x + y * y + z * z)
-
-
-@jit
-def _wall_gap(x, r, i, k, point, normal):
-    """Return the gap between sphere i and plane k whose normal points to the bodies."""
-    return (
-        (x[i, 0] - point[k, 0]) * normal[k, 0]
-        + (x[i, 1] - point[k, 1]) * normal[k, 1]
-        + (x[i, 2] - point[k, 2]) * normal[k, 2]
-    ) - r[i]
-
-
-@jit
-def _wall_margin(v, w, r, i, k, velocity, mu, h, c):
-    speed = _norm(v[i, 0] - velocity[k, 0], v[i, 1] - velocity[k, 1], v[i, 2] - velocity[k, 2])
-    spin = _norm(w[i, 0], w[i, 1], w[i, 2]) * r[i]
-    return max(c * r[i], h * (speed * (1.0 + mu) + spin))
 
 
 @jit
@@ -215,37 +205,31 @@ def _distance(x, a, b):
 
 @jit_threads
 def count_contacts(
-    x,
-    r,
-    v,
-    w,
-    material,
-    friction,
-    offset,
-    neighbour,
-    point,
-    normal,
-    wall_velocity,
-    wall_material,
-    h,
-    c,
-    count,
-):
+    x, r, v, w, material, friction, offset, neighbour,
+    face, wall_material, h, c, count,
+):  # fmt: skip
     """Count the contacts of each owned body: those with walls, then those with listed bodies.
 
     A pair is a contact iff phi <= max(c min(r_a, r_b), h (|v_a - v_b| (1 + mu) + |w_a| r_a +
     |w_b| r_b)): wide enough that a sliding contact, which hovers at h mu |v_t|, does not flicker.
+    With a wall a body may have two.
 
     count : (n + 1,) int64; contacts of body a go to count[a + 1].
     """
     for a in prange(offset.shape[0] - 1):
         found = 0
-        for k in range(point.shape[0]):
+        rolling = _norm(w[a, 0], w[a, 1], w[a, 2]) * r[a]
+        ax, ay, az, ra = x[a, 0], x[a, 1], x[a, 2], r[a]
+        vx, vy, vz = v[a, 0], v[a, 1], v[a, 2]
+        for k in range(face.shape[0]):
             mu = friction[material[a], wall_material[k]]
-            if _wall_gap(x, r, a, k, point, normal) <= _wall_margin(
-                v, w, r, a, k, wall_velocity, mu, h, c
-            ):
-                found += 1
+            limit = largest_margin(face, k, ax, ay, az, vx, vy, vz, ra, rolling, mu, h, c)
+            if not may_touch(face, k, ax, ay, az, ra, limit):
+                continue
+            first, second, _, _ = touches(
+                face, k, ax, ay, az, vx, vy, vz, ra, rolling, mu, h, c, limit
+            )
+            found += int(first) + int(second)
         for p in range(offset[a], offset[a + 1]):
             b = neighbour[p]
             mu = friction[material[a], material[b]]
@@ -257,37 +241,45 @@ def count_contacts(
 @jit_threads
 def fill_contacts(
     x, r, v, w, gid, material, friction, offset, neighbour,
-    point, normal, wall_velocity, wall_material, h, c,
+    face, wall_material, h, c,
     row, ca, cb, other, n_out, gap, arm, mu_out, coincident,
 ):  # fmt: skip
     """Write the contacts counted by `count_contacts`; contacts of body a stand at row[a]:row[a+1].
 
-    Walls come first, in ascending id; so contacts are ordered by (a, gid of b).
+    Walls come first, in ascending id; so contacts are ordered by (a, gid of b), and of two with
+    one wall the nearer stands first.
     Both arms end in the middle of the gap (arm = r + phi/2), or a tangential
     impulse would leave the torque phi n x p. Coincident centres: n = e_z, counted.
 
     ca, cb : (m,) int32 local rows (a wall k is -(k + 1)); other : (m,) int64 gid or wall id;
     n_out : (m, 3) from a to b; gap : (m,) [m]; arm : (m, 2) [m]; mu_out : (m,).
     """
-    walls = point.shape[0]
+    walls = face.shape[0]
     for a in prange(offset.shape[0] - 1):
         at = row[a]
+        rolling = _norm(w[a, 0], w[a, 1], w[a, 2]) * r[a]
+        ax, ay, az, ra = x[a, 0], x[a, 1], x[a, 2], r[a]
+        vx, vy, vz = v[a, 0], v[a, 1], v[a, 2]
         for q in range(walls):
             k = walls - 1 - q
             mu = friction[material[a], wall_material[k]]
-            phi = _wall_gap(x, r, a, k, point, normal)
-            if phi <= _wall_margin(v, w, r, a, k, wall_velocity, mu, h, c):
+            limit = largest_margin(face, k, ax, ay, az, vx, vy, vz, ra, rolling, mu, h, c)
+            if not may_touch(face, k, ax, ay, az, ra, limit):
+                continue
+            first, second, near, far = touches(
+                face, k, ax, ay, az, vx, vy, vz, ra, rolling, mu, h, c, limit
+            )
+            for _ in range(int(first) + int(second)):
+                phi, n_out[at, 0], n_out[at, 1], n_out[at, 2] = near if first else far
                 ca[at] = a
                 cb[at] = -(k + 1)
                 other[at] = -(k + 1)
-                n_out[at, 0] = -normal[k, 0]
-                n_out[at, 1] = -normal[k, 1]
-                n_out[at, 2] = -normal[k, 2]
                 gap[at] = phi
                 arm[at, 0] = r[a] + 0.5 * phi
                 arm[at, 1] = 0.0
                 mu_out[at] = mu
                 at += 1
+                first = False
         for p in range(offset[a], offset[a + 1]):
             b = neighbour[p]
             mu = friction[material[a], material[b]]
@@ -317,7 +309,8 @@ def fill_contacts(
 def match_impulses(row, other, old_row, old_other, old_impulse, impulse):
     """Carry world-frame impulses over to contacts that exist again; returns nothing, fills.
 
-    Both lists are ordered by the other body's gid within each body: one merge a body.
+    Both lists are ordered by the other body's gid within each body: one merge a body. Two contacts
+    with the same partner match in the order in which they stand.
     impulse : (m, 3) zeros on entry.
     """
     for a in prange(row.shape[0] - 1):
@@ -329,6 +322,7 @@ def match_impulses(row, other, old_row, old_other, old_impulse, impulse):
                 impulse[i, 0] = old_impulse[p, 0]
                 impulse[i, 1] = old_impulse[p, 1]
                 impulse[i, 2] = old_impulse[p, 2]
+                p += 1
 
 
 @jit

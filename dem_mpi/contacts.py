@@ -3,7 +3,8 @@
 A pair is a contact iff its gap is at most max(c min(r_a, r_b), h (|v_a - v_b| (1 + mu) +
 |w_a| r_a + |w_b| r_b)): bitwise the same on any number of ranks. Near pairs are listed with that
 margin and a skin, and the list stands until a body may have moved, or its margin grown, by half
-the skin.
+the skin. In a periodic box it joins bodies with images of others: ghost rows that are displaced
+by the period.
 
 A contact joins a and b with gid(a) < gid(b) and belongs to the rank that owns a; walls are always
 b, with negative ids. The normal points from a to b; the gap is positive when they are apart.
@@ -20,8 +21,10 @@ from numpy.typing import NDArray
 from dem_mpi import _kernels_detection as kernels
 from dem_mpi import _kernels_solver as frames
 from dem_mpi.bodies import Bodies, ImpulseMemory
+from dem_mpi.errors import DemError
 from dem_mpi.parallel import Halo, Parallel
-from dem_mpi.partition import Partition, ghost_targets
+from dem_mpi.partition import Partition, ghost_targets, image_targets
+from dem_mpi.periodic import ITSELF, PeriodicBox
 from dem_mpi.walls import Walls, velocity_at
 
 
@@ -30,12 +33,14 @@ class DetectionOptions:
     """What decides which pairs are listed and which are contacts.
 
     margin : c, in smaller radii; skin : [m]; friction : (materials, materials) table of mu
+    box    : the periodic box, None where no axis repeats
     """
 
     margin: float
     skin: float
     friction: NDArray
     threads: int = 1
+    box: PeriodicBox | None = None
 
     @property
     def largest_friction(self) -> float:
@@ -96,7 +101,11 @@ class Neighbours:
 
     Rows: n owned bodies, then the ghosts that some pair needs. gid, radius, material,
     inverse_mass, inverse_inertia cover all rows. The pairs of body a are
-    neighbour[offset[a]:offset[a + 1]], in ascending gid.
+    neighbour[offset[a]:offset[a + 1]], in ascending gid, and those with several images of one
+    body in order of the image.
+
+    shift : (g, 3) [m] displacement of the ghosts from the bodies they are images of; None where
+            no axis is periodic
     """
 
     reference: Reference
@@ -108,6 +117,7 @@ class Neighbours:
     inverse_inertia: NDArray
     offset: NDArray
     neighbour: NDArray
+    shift: NDArray | None = None
 
     @property
     def pairs(self) -> int:
@@ -121,10 +131,21 @@ class Neighbours:
         self.halo.forward(rows)
         return rows
 
+    def extend_position(self, owned: NDArray) -> NDArray:
+        """Collective. As `extend`, for positions (n, 3) [m]: images stand where they are seen."""
+        rows = self.extend(owned)
+        if self.shift is not None:
+            rows[self.halo.owned :] += self.shift
+        return rows
+
+
+class PeriodTooShortError(DemError):
+    """The periodic box is narrower than the distance at which bodies interact."""
+
 
 @dataclass(frozen=True)
 class ContactSet:
-    """The contacts this rank owns, ordered by (row of a, gid of b); walls first.
+    """The contacts this rank owns, ordered by (row of a, gid of b, image of b); walls first.
 
     a, b       : (m,) int32 local rows; b = -(k + 1) is wall k
     other      : (m,) int64 gid of b, or the wall's id
@@ -170,8 +191,9 @@ def find_neighbours(
 ) -> Neighbours:
     """Collective. Make ghosts and list near pairs as the bodies stood at the reference.
 
-    Every body must be on the rank that owned its key at the reference. O(n) by a hashed grid with
-    one level for each doubling of the size.
+    Every body must be on the rank that owned its key at the reference, and in the periodic box.
+    O(n) by a hashed grid with one level for each doubling of the size. PeriodTooShortError on all
+    ranks if bodies could interact with images further away than the next.
     """
     owned = len(bodies)
     # Two bodies are near iff their distance <= r + r + max(c min(r, r), reach + reach) + skin,
@@ -182,8 +204,11 @@ def find_neighbours(
         + 0.5 * options.skin
     )
     largest = parallel.max(float(effective.max(initial=0.0)))
-    targets = ghost_targets(parallel, partition, reference.position, effective + largest)
-    halo = Halo.build(parallel, owned, targets)
+    _check_period(options.box, 2.0 * largest)
+    halo, image = _make_ghosts(
+        parallel, partition, reference.position, effective + largest, options.box
+    )
+    shift = None if options.box is None else options.box.shift(image[owned:])
 
     static = Neighbours(
         reference=reference,
@@ -195,9 +220,10 @@ def find_neighbours(
         inverse_inertia=1.0 / bodies.inertia,
         offset=np.zeros(owned + 1, dtype=np.int64),
         neighbour=np.empty(0, dtype=np.int32),
+        shift=shift,
     )
     gid, radius = static.extend(static.gid), static.extend(static.radius)
-    position, reach = static.extend(reference.position), static.extend(reference.reach)
+    position, reach = static.extend_position(reference.position), static.extend(reference.reach)
     effective = static.extend(effective)
     low, high = _near_pairs(position, radius, reach, effective, gid, owned, options)
 
@@ -206,10 +232,10 @@ def find_neighbours(
     needed[:owned] = True
     pruned = halo.keep(needed[owned:])
     renumber = (np.cumsum(needed) - 1).astype(np.int32)
-    gid = gid[needed]
+    gid, image = gid[needed], image[needed]
     offset = np.zeros(owned + 1, dtype=np.int64)
     neighbour = np.empty(low.shape[0], dtype=np.int32)
-    kernels.group_pairs(low, renumber[high], gid, owned, offset, neighbour)
+    kernels.group_pairs(low, renumber[high], gid, image, owned, offset, neighbour)
     return Neighbours(
         reference=reference,
         halo=pruned,
@@ -220,7 +246,42 @@ def find_neighbours(
         inverse_inertia=static.extend(static.inverse_inertia)[needed],
         offset=offset,
         neighbour=neighbour,
+        shift=None if shift is None else shift[needed[owned:]],
     )
+
+
+def _check_period(box: PeriodicBox | None, interaction: float) -> None:
+    """PeriodTooShortError if images beyond the next ones could come within `interaction` [m]."""
+    if box is None:
+        return
+    shortest, axis = box.shortest
+    if interaction > shortest:
+        raise PeriodTooShortError(
+            f"the domain repeats every {shortest:.6g} m along {axis}, but bodies may interact over "
+            f"up to {interaction:.6g} m, a distance that grows with their size and with their "
+            f"speed times the step: lengthen the domain, or lower time.step or contact.skin"
+        )
+
+
+def _make_ghosts(
+    parallel: Parallel,
+    partition: Partition,
+    position: NDArray,
+    reach: NDArray,
+    box: PeriodicBox | None,
+) -> tuple[Halo, NDArray]:
+    """Collective. The halo of all ghosts within reach, and the image code (n + g,) of each row."""
+    rows: dict[int, NDArray] = dict(ghost_targets(parallel, partition, position, reach))
+    if box is None:
+        halo = Halo.build(parallel, len(position), rows)
+        return halo, np.full(halo.owned + halo.ghosts, ITSELF, dtype=np.int8)
+    codes = {rank: np.full(len(index), ITSELF, dtype=np.int8) for rank, index in rows.items()}
+    for rank, (index, code) in image_targets(partition, box, position, reach).items():
+        rows[rank] = np.concatenate((rows.get(rank, index[:0]), index))
+        codes[rank] = np.concatenate((codes.get(rank, code[:0]), code))
+    halo = Halo.build(parallel, len(position), rows)
+    mine = np.full(halo.owned, ITSELF, dtype=np.int8)
+    return halo, np.concatenate((mine, halo.deliver(codes)))
 
 
 def _near_pairs(
@@ -276,8 +337,7 @@ def find_contacts(
     motion = (position, n.radius, predicted, angular_velocity)
     material = (n.material, options.friction)
     pairs = (n.offset, n.neighbour)
-    planes = (np.ascontiguousarray(walls.geometry[:, i : i + 3]) for i in (0, 3))
-    wall = (*planes, walls.velocity, walls.material)
+    wall = (walls.rows(), walls.material)
     rule = (step, options.margin)
     kernels.count_contacts.using(options.threads)(*motion, *material, *pairs, *wall, *rule, row)
     np.cumsum(row, out=row)

@@ -11,6 +11,7 @@ sin(phase)) + the integral of the table's velocity.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,6 +54,15 @@ class WallFaces:
     until: NDArray
     motion: tuple[Motion | None, ...]
 
+    @cached_property
+    def drives(self) -> list[tuple[Drive, list[int]]]:
+        """Every motion once, with the faces that it moves."""
+        moved: dict[int, tuple[Drive, list[int]]] = {}
+        for k, motion in enumerate(self.motion):
+            if motion is not None:
+                moved.setdefault(id(motion), (Drive(motion), []))[1].append(k)
+        return list(moved.values())
+
     @property
     def point(self) -> NDArray:
         """A point of each face, (w, 3) [m]."""
@@ -69,7 +79,8 @@ class Walls:
     """The faces at one instant, and their mean motion over a step.
 
     kind, geometry, material as in WallFaces, moved; kind is ABSENT where a face has vanished.
-    A point p of face k has the velocity velocity[k] + spin[k] x (p - centre[k]) [m/s].
+    A point p of face k has the velocity velocity[k] + spin[k] x (p - centre[k]) [m/s]; centre is
+    on the axis of a wall that turns, and else the point of the face.
     """
 
     kind: NDArray
@@ -83,6 +94,14 @@ class Walls:
     def moving(self) -> bool:
         """Whether any face moves."""
         return bool(self.velocity.any() or self.spin.any())
+
+    def rows(self) -> NDArray:
+        """All that contact detection asks of a face in one row, (w, 22).
+
+        geometry 0:12, velocity 12:15, spin 15:18, centre 18:21, kind 21.
+        """
+        columns = (self.geometry, self.velocity, self.spin, self.centre, self.kind[:, None])
+        return np.hstack(columns).astype(np.float64, copy=False)
 
 
 def wall_faces(scenario: Scenario) -> WallFaces:
@@ -153,62 +172,102 @@ def _unit(vector: Vec3 | NDArray) -> NDArray:
 # ---- motion --------------------------------------------------------------------------------
 
 
+class _Table:
+    """What is linear between times and constant outside them, ready to be integrated."""
+
+    def __init__(self, times: ArrayLike, values: ArrayLike) -> None:
+        """Take times (k,) and values (k, c)."""
+        self._times = np.asarray(times, dtype=np.float64)
+        self._values = np.asarray(values, dtype=np.float64)
+        areas = np.diff(self._times)[:, None] * 0.5 * (self._values[1:] + self._values[:-1])
+        self._areas = np.concatenate((np.zeros((1, areas.shape[1])), np.cumsum(areas, axis=0)))
+
+    def integral(self, start: float, end: float) -> NDArray:
+        """Return the integral (c,) from start to end, at a cost that is free of the length."""
+        low, high = np.searchsorted(self._times, (start, end), side="right")
+        if abs(high - low) <= 1:  # not as a difference of two large areas
+            middle = [self._times[min(low, high)]] if low != high else []
+            points = np.array([start, *middle, end])
+            values = np.array([self._at(point) for point in points])
+            return np.diff(points) @ (0.5 * (values[1:] + values[:-1]))
+        return self._primitive(end, int(high)) - self._primitive(start, int(low))
+
+    def _at(self, time: float) -> NDArray:
+        i = int(np.clip(np.searchsorted(self._times, time, side="right"), 1, len(self._times)))
+        before = self._times[i - 1]
+        if time <= before or i == len(self._times):
+            return self._values[i - 1]
+        share = (time - before) / (self._times[i] - before)
+        return (1.0 - share) * self._values[i - 1] + share * self._values[i]
+
+    def _primitive(self, time: float, above: int) -> NDArray:
+        """The integral from the first of the times; `above` of them are at most `time`."""
+        i = max(above - 1, 0)
+        mean = 0.5 * (self._values[i] + self._at(time))
+        return self._areas[i] + (time - self._times[i]) * mean
+
+
+class Drive:
+    """A motion whose tables are arrays, so that an evaluation costs the same at any time."""
+
+    def __init__(self, motion: Motion) -> None:
+        self._velocity = np.array(motion.velocity)
+        self._swing = motion.oscillation
+        table = motion.table
+        self._table = None if table is None else _Table(table.time, table.velocity)
+        self.rotation = motion.rotation
+        rates = None if motion.rotation is None else motion.rotation.table
+        self._rates = None if rates is None else _Table(rates.time, np.array(rates.rate)[:, None])
+
+    def shift(self, start: float, end: float) -> NDArray:
+        """Return the displacement (3,) [m] between two times [s], the rotation left aside."""
+        shift = self._velocity * (end - start)
+        if self._swing is not None:
+            # sin b - sin a = 2 cos((a + b)/2) sin((b - a)/2), without a difference of near values
+            half = np.pi * self._swing.frequency
+            middle = half * (start + end) + self._swing.phase
+            change = 2.0 * np.cos(middle) * np.sin(half * (end - start))
+            shift = shift + np.array(self._swing.amplitude) * change
+        if self._table is not None:
+            shift = shift + self._table.integral(start, end)
+        return shift
+
+    def turn(self, start: float, end: float) -> float:
+        """Return the angle [rad] turned between two times [s]."""
+        if self.rotation is None:
+            return 0.0
+        angle = self.rotation.rate * (end - start)
+        if self._rates is not None:
+            angle += float(self._rates.integral(start, end)[0])
+        return angle
+
+
 def walls_at(faces: WallFaces, time: float, step: float) -> Walls:
     """Return the faces as they stand at `time` [s], with their mean velocity over the step.
 
     The mean velocity, not the instant's, so that contact impulses and positions agree: after the
-    step the wall is where its velocity has taken it.
+    step a wall that does not turn is where its velocity has taken it.
     """
     count = len(faces.name)
     geometry = faces.geometry.copy()
-    velocity, spin, centre = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3))
-    for k, motion in enumerate(faces.motion):
-        if motion is None:
-            continue
-        now = displacement(motion, time)
-        velocity[k] = (displacement(motion, time + step) - now) / step
-        if motion.rotation is not None:
-            axis, angle = _unit(motion.rotation.axis), turn(motion, time)
-            spin[k] = axis * ((turn(motion, time + step) - angle) / step)
-            centre[k] = np.array(motion.rotation.centre) + now
-            _rotate(geometry[k], faces.kind[k], np.array(motion.rotation.centre), axis, angle)
-        geometry[k, _POINTS] += now
-    kind = np.where(time >= faces.until, ABSENT, faces.kind).astype(np.int8)
+    velocity, spin = np.zeros((count, 3)), np.zeros((count, 3))
+    centre = faces.point.copy()
+    for drive, moved in faces.drives:
+        now = drive.shift(0.0, time)
+        velocity[moved] = drive.shift(time, time + step) / step
+        rotation = drive.rotation
+        if rotation is not None:
+            axis, angle = _unit(rotation.axis), drive.turn(0.0, time)
+            spin[moved] = axis * (drive.turn(time, time + step) / step)
+            centre[moved] = rotation.centre
+            for k in moved:
+                _rotate(geometry[k], faces.kind[k], np.array(rotation.centre), axis, angle)
+        geometry[moved, _POINTS] += now
+        centre[moved] += now
+    # A time that is meant to be a step's is missed by rounding.
+    gone = time + 1e-9 * step >= faces.until
+    kind = np.where(gone, ABSENT, faces.kind).astype(np.int8)
     return Walls(kind, geometry, faces.material, velocity, spin, centre)
-
-
-def displacement(motion: Motion, time: float) -> NDArray:
-    """Return the shift (3,) [m] of a wall since time 0, its rotation left aside."""
-    shift = np.array(motion.velocity) * time
-    swing = motion.oscillation
-    if swing is not None:
-        angle = 2.0 * np.pi * swing.frequency * time + swing.phase
-        shift += np.array(swing.amplitude) * (np.sin(angle) - np.sin(swing.phase))
-    if motion.table is not None:
-        velocity = np.array(motion.table.velocity)
-        shift += np.array([integral(motion.table.time, velocity[:, i], time) for i in range(3)])
-    return shift
-
-
-def turn(motion: Motion, time: float) -> float:
-    """Return the angle [rad] that a wall has turned since time 0."""
-    rotation = motion.rotation
-    if rotation is None:
-        return 0.0
-    angle = rotation.rate * time
-    if rotation.table is not None:
-        angle += integral(rotation.table.time, np.array(rotation.table.rate), time)
-    return angle
-
-
-def integral(times: ArrayLike, values: NDArray, end: float) -> float:
-    """Return the integral from 0 to `end` of what is linear between times, constant outside."""
-    knots = np.asarray(times, dtype=np.float64)
-    inner = knots[(knots > min(0.0, end)) & (knots < max(0.0, end))]
-    points = np.concatenate(([min(0.0, end)], inner, [max(0.0, end)]))
-    heights = np.interp(points, knots, values)
-    area = float(np.sum(0.5 * (heights[1:] + heights[:-1]) * np.diff(points)))
-    return area if end >= 0.0 else -area
 
 
 def _rotate(row: NDArray, kind: int, centre: NDArray, axis: NDArray, angle: float) -> None:
