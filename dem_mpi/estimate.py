@@ -24,10 +24,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from dem_mpi.bodies import FIELDS
-from dem_mpi.placement import largest_radius, smallest_radius
 from dem_mpi.scenario import Scenario, body_count, friction_table, frictional
 from dem_mpi.scene_walls import BoxWall
 from dem_mpi.shapes import sphere_volume
+from dem_mpi.sizes import largest_radius, smallest_radius
 from dem_mpi.walls import wall_faces
 
 _PACKING_FRACTION = 0.6  # of a settled bed

@@ -1,25 +1,33 @@
 """Initial bodies: each rank makes its own share, and the result does not depend on the ranks.
 
-Body gid's random numbers are words of the Philox counter generator with key (seed, group),
-two counters (eight words) a body, so a rank starts at its first body without drawing the
-others'. The raw words are used: their sequence is fixed for all versions of numpy, which
-the sequence of its distributions is not.
+Body i of a group has eight random numbers of its own, and more for other purposes, from a
+generator that is a function of (seed, group, i): see `counter_random`.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dem_mpi import sizes
 from dem_mpi.body_file import BodyFile
-from dem_mpi.errors import InputError
-from dem_mpi.scene_bodies import BodyGroup, JitteredGrid, UniformRadius
+from dem_mpi.counter_random import WORDS_PER_BLOCK, Purpose, key_of, uniform
+from dem_mpi.errors import DemError, InputError
+from dem_mpi.scene_bodies import SHAPES, BodyGroup, JitteredGrid
 from dem_mpi.scene_models import Scenario
+from dem_mpi.sizes import largest_reach
+
+if TYPE_CHECKING:  # a scene is checked without starting MPI
+    from dem_mpi.parallel import Parallel
 
 # Eight random words a body: three for the position, one for the radius, three for the velocity.
 WORDS_PER_BODY = 8
+_BLOCKS = WORDS_PER_BODY // WORDS_PER_BLOCK
 _POSITION, _RADIUS, _VELOCITY = slice(0, 3), 3, slice(4, 7)
 
 # Room for the rounding of region / spacing; bodies may overlap by this part of a cell at most.
@@ -59,25 +67,6 @@ class Grid:
         cell, reach = np.array(self.cell), np.array(self.shift) + radius
         first = np.array(self.origin) + 0.5 * cell
         return first - reach, first + column * cell + reach
-
-
-def largest_radius(group: BodyGroup) -> float:
-    """The largest radius [m] that the scene states for a group."""
-    return max(_stated_radii(group))
-
-
-def smallest_radius(group: BodyGroup) -> float:
-    """The smallest radius [m] that the scene states for a group."""
-    return min(_stated_radii(group))
-
-
-def _stated_radii(group: BodyGroup) -> tuple[float, ...]:
-    if isinstance(group.radius, UniformRadius):
-        return group.radius.uniform
-    if isinstance(group.radius, tuple):
-        return group.radius
-    assert group.radius is not None, "a group without radii takes them from its file"
-    return (group.radius,)
 
 
 def grid_capacity(region: JitteredGrid, spacing: float) -> int:
@@ -139,91 +128,147 @@ def share(total: int, rank: int, size: int) -> tuple[int, int]:
     return total * rank // size, total * (rank + 1) // size
 
 
-def place(scenario: Scenario, rank: int, size: int) -> dict[str, np.ndarray]:
-    """The bodies that `rank` of `size` ranks starts with: a contiguous range of gids.
+def place(parallel: Parallel, scenario: Scenario) -> dict[str, np.ndarray]:
+    """Collective. The bodies that this rank starts with, those of insertion groups left out.
 
     Returns gid (n,) int64; position (n, 3) [m], velocity (n, 3) [m/s], angular_velocity (n, 3)
-    [rad/s], orientation (n, 4) scalar first, radius (n,) [m], all float64; material (n,) int32.
-    The bits do not depend on `size`. Raises DataError for a damaged file of bodies.
+    [rad/s], orientation (n, 4) scalar first, radius (n,), half_length (n,) [m], all float64;
+    material (n,) int32; shape (n,) int8, an index into SHAPES. Each body's bits are the same on
+    any number of ranks. Raises DataError for a damaged file of bodies, InputError where a random
+    placement finds no room.
     """
-    files = [_open_file(group) for group in scenario.bodies]
-    counts = [
-        group.count if group.count is not None else file.rows
-        for group, file in zip(scenario.bodies, files, strict=True)
-    ]
+    error = None
+    try:
+        parts = [place_share(scenario, parallel.rank, parallel.size)]
+    except DemError as caught:
+        error = caught
+    parallel.raise_together(error)
+    return parts[0]
+
+
+def place_share(scenario: Scenario, rank: int, size: int) -> dict[str, np.ndarray]:
+    """The bodies on grids and in files that `rank` of `size` ranks makes: a range of gids."""
+    counts = group_counts(scenario)
+    offsets = first_gids(counts)
     first, last = share(sum(counts), rank, size)
-    materials = list(scenario.materials)
     parts = []
-    offset = 0
-    for number, (group, file) in enumerate(zip(scenario.bodies, files, strict=True)):
-        start, stop = (min(max(gid - offset, 0), counts[number]) for gid in (first, last))
-        part = _place_group(group, file, counts[number], (scenario.seed, number), start, stop)
-        part["gid"] = np.arange(offset + start, offset + stop, dtype=np.int64)
-        part["material"] = np.full(stop - start, materials.index(group.material), dtype=np.int32)
-        parts.append(part)
-        offset += counts[number]
+    for number, group in enumerate(scenario.bodies):
+        start, stop = (min(max(gid - offsets[number], 0), counts[number]) for gid in (first, last))
+        if not group.placement.stands_at_start:
+            stop = start
+        parts.append(_place_group(scenario, number, counts[number], start, stop))
+    return _joined(parts)
+
+
+def _joined(parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The rows of all parts."""
     return {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
 
 
-def _open_file(group: BodyGroup) -> BodyFile | None:
-    if group.placement.file is None:
-        return None
+def group_counts(scenario: Scenario) -> list[int]:
+    """Number of bodies of each group; reads the length of a file where the scene gives none."""
+    return [
+        group.count if group.count is not None else _open_file(group).rows
+        for group in scenario.bodies
+    ]
+
+
+def first_gids(counts: Sequence[int]) -> list[int]:
+    """The gid of each group's first body: groups are numbered through in the scene's order."""
+    return [0, *itertools.accumulate(counts)][:-1]
+
+
+def _open_file(group: BodyGroup) -> BodyFile:
     return BodyFile(group.placement.path, group.placement.dataset)
 
 
 def _place_group(
-    group: BodyGroup,
-    file: BodyFile | None,
-    count: int,
-    key: tuple[int, int],
-    start: int,
-    stop: int,
+    scenario: Scenario, number: int, count: int, start: int, stop: int
 ) -> dict[str, np.ndarray]:
-    """Bodies start <= index < stop of one group; `key` is (seed, number of the group)."""
-    n = stop - start
-    stated = file.read(start, stop) if file is not None and n > 0 else {}
-    random = _uniform(key, start, n) if _is_random(group) else np.full((n, WORDS_PER_BODY), 0.5)
+    """Bodies start <= index < stop of one group on a grid or in a file."""
+    group, n = scenario.bodies[number], stop - start
+    index = np.arange(start, stop, dtype=np.int64)
+    stated: dict[str, np.ndarray] = {}
+    position = np.zeros((n, 3))
+    if group.placement.file is not None and n > 0:
+        stated = _open_file(group).read(start, stop)
+    if group.placement.jittered_grid is not None and n > 0:
+        cells = grid(group.placement.jittered_grid, count, largest_reach(group))
+        if cells.capacity < count:
+            raise InputError(f"bodies[{number}].count = {count}: only {cells.capacity} fit")
+        random = _words(scenario, number, index)[:, _POSITION]
+        position = cells.centres(start, stop) + (2 * random - 1) * np.array(cells.shift)
+    return bodies_of(scenario, number, index, stated.pop("position", position), stated)
+
+
+def bodies_of(
+    scenario: Scenario,
+    number: int,
+    index: np.ndarray,
+    position: np.ndarray,
+    stated: Mapping[str, np.ndarray] | None = None,
+) -> dict[str, np.ndarray]:
+    """All arrays of the bodies `index` (n,) of group `number` at `position` (n, 3) [m].
+
+    What `stated` holds replaces what the group says. The arrays are those of `place`.
+    """
+    group, n = scenario.bodies[number], len(index)
+    random = _words(scenario, number, index)
     bodies = {
-        "position": np.empty((n, 3)),
-        "radius": _radii(group, start, stop, random[:, _RADIUS]),
+        "gid": first_gids(group_counts(scenario))[number] + np.asarray(index, dtype=np.int64),
+        "material": np.full(n, list(scenario.materials).index(group.material), dtype=np.int32),
+        "shape": np.full(n, SHAPES.index(group.shape), dtype=np.int8),
+        "position": position,
+        "radius": sizes.radii(group, index, random[:, _RADIUS]),
         "velocity": np.tile(np.array(group.velocity), (n, 1)),
         "angular_velocity": np.tile(np.array(group.angular_velocity), (n, 1)),
-        "orientation": np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        "orientation": _orientations(scenario, number, index),
     }
-    if group.placement.jittered_grid is not None and n > 0:
-        cells = grid(group.placement.jittered_grid, count, largest_radius(group))
-        if cells.capacity < count:
-            raise InputError(f"bodies[{key[1]}].count = {count}: only {cells.capacity} fit")
-        shift = (2 * random[:, _POSITION] - 1) * np.array(cells.shift)
-        bodies["position"] = cells.centres(start, stop) + shift
-    bodies.update(stated)
+    bodies.update(stated or {})
+    bodies["half_length"] = sizes.half_length_factor(group) * bodies["radius"]
     if group.velocity_jitter > 0:
         kick = (2 * random[:, _VELOCITY] - 1) * group.velocity_jitter
         bodies["velocity"] = bodies["velocity"] + kick
     return bodies
 
 
-def _is_random(group: BodyGroup) -> bool:
-    """Whether any property of the group is drawn at random."""
+def reaches(group: BodyGroup, seed: int, number: int, index: np.ndarray) -> np.ndarray:
+    """Radii (n,) [m] of the bounding spheres of the bodies `index` (n,) of group `number`."""
+    random = np.zeros(len(index))
+    if sizes.is_drawn(group):
+        random = uniform(key_of(seed, number), index, blocks=_BLOCKS)[:, _RADIUS]
+    return sizes.reach_factor(group) * sizes.radii(group, index, random)
+
+
+def _words(scenario: Scenario, number: int, index: np.ndarray) -> np.ndarray:
+    """The random numbers (n, 8) of bodies; not drawn, but 1/2, where the group needs none."""
+    group = scenario.bodies[number]
     cells = group.placement.jittered_grid
     jittered = cells is not None and cells.jitter > 0
-    return jittered or group.velocity_jitter > 0 or isinstance(group.radius, UniformRadius)
+    if not (jittered or group.velocity_jitter > 0 or sizes.is_drawn(group)):
+        return np.full((len(index), WORDS_PER_BODY), 0.5)
+    return uniform(key_of(scenario.seed, number), index, blocks=_BLOCKS)
 
 
-def _radii(group: BodyGroup, start: int, stop: int, random: np.ndarray) -> np.ndarray:
-    """Radii (n,) [m] as the scene states them; zeros where they come from the file."""
-    if group.radius is None:
-        return np.zeros(stop - start)
-    if isinstance(group.radius, UniformRadius):
-        low, high = group.radius.uniform
-        return low + (high - low) * random
-    values = np.array(_stated_radii(group))
-    return values[np.arange(start, stop, dtype=np.int64) % len(values)]
+def _orientations(scenario: Scenario, number: int, index: np.ndarray) -> np.ndarray:
+    """Unit quaternions (n, 4) that turn the body's z axis to the group's direction."""
+    group, n = scenario.bodies[number], len(index)
+    if group.axis != "random":
+        axis = np.array(group.axis)
+        return np.tile(_turn_z_to(axis[None] / np.linalg.norm(axis)), (n, 1))
+    # Uniform on the sphere: height and azimuth are (Archimedes).
+    random = uniform(key_of(scenario.seed, number), index, Purpose.AXIS)
+    height, azimuth = 2.0 * random[:, 0] - 1.0, 2.0 * np.pi * random[:, 1]
+    width = np.sqrt(1.0 - height**2)
+    return _turn_z_to(np.stack([width * np.cos(azimuth), width * np.sin(azimuth), height], axis=1))
 
 
-def _uniform(key: tuple[int, int], start: int, n: int) -> np.ndarray:
-    """Uniform numbers (n, 8) in [0, 1) of the bodies from `start` on."""
-    generator = np.random.Philox(key=np.array(key, dtype=np.uint64))
-    generator.advance(start * WORDS_PER_BODY // 4)
-    words = generator.random_raw(n * WORDS_PER_BODY)
-    return (words >> np.uint64(11)).reshape(n, WORDS_PER_BODY) * 2.0**-53
+def _turn_z_to(axis: np.ndarray) -> np.ndarray:
+    """The shortest rotations (n, 4) from e_z to unit vectors (n, 3)."""
+    x, y, z = axis.T
+    # q ~ (1 + cos, e_z x axis); 1 + cos = sin^2 / (1 - cos) keeps its digits near -e_z.
+    sine_squared = x**2 + y**2
+    one_plus = np.where(z < 0.0, sine_squared / (1.0 + np.abs(z)), 1.0 + z)
+    quaternion = np.stack([one_plus, -y, x, np.zeros_like(x)], axis=1)
+    quaternion[(sine_squared == 0.0) & (z < 0.0)] = (0.0, 1.0, 0.0, 0.0)
+    return quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)

@@ -136,7 +136,7 @@ class Run:
             self._say(f"no checkpoint in {self._path.parent}: starting from the beginning")
         else:
             self._refuse_to_replace()
-        arrays = place(self._scenario, parallel.rank, parallel.size)
+        arrays = place(parallel, self._scenario)
         density = [material.density for material in self._scenario.materials.values()]
         state = start(parallel, Bodies.from_arrays(arrays, density))
         spinning = parallel.any(bool(state.bodies.angular_velocity.any()))
@@ -300,7 +300,9 @@ class Run:
     def _write_frame(self) -> None:
         state = self._simulation.state
         time = state.step * self._scenario.time.step
-        self._trajectory.write_frame(state.step, time, state.bodies.arrays())
+        position = self._simulation.wrapped_position()
+        columns = {**state.bodies.arrays(), "position": position}
+        self._trajectory.write_frame(state.step, time, columns)
 
     def _save(self) -> Path:
         """Collective. Checkpoint; the frames before it reach the disk first."""

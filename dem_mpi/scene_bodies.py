@@ -230,6 +230,11 @@ class Placement(Model):
         return self
 
     @property
+    def stands_at_start(self) -> bool:
+        """Whether the scene itself says where each body starts."""
+        return self.jittered_grid is not None or self.file is not None
+
+    @property
     def path(self) -> Path:
         """The file of positions, seen from the process; only where `file` is given."""
         return self._directory / (self.file or "")

@@ -10,16 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from dem_mpi.body_file import BodyFile
-from dem_mpi.placement import (
-    grid,
-    grid_capacity,
-    largest_radius,
-    smallest_radius,
-)
+from dem_mpi.placement import grid, grid_capacity
 from dem_mpi.scene_bodies import BodyGroup
 from dem_mpi.scene_errors import nearest
 from dem_mpi.scene_models import Scenario
 from dem_mpi.scene_walls import wall_name
+from dem_mpi.sizes import largest_reach, thinnest_half
 from dem_mpi.walls import PLANE, wall_faces
 from dem_mpi.yaml_reader import KeyPath
 
@@ -121,7 +117,7 @@ def _grid_room(index: int, group: BodyGroup) -> Iterator[Finding]:
     assert region is not None
     assert group.count is not None
     here: KeyPath = ("bodies", index, "placement", "jittered_grid")
-    diameter = 2 * largest_radius(group)
+    diameter = 2 * largest_reach(group)
     size = " x ".join(f"{b - a:.6g}" for a, b in zip(region.min, region.max, strict=True))
     if region.spacing is not None and region.spacing < diameter * (1 - 1e-12):
         yield Finding((*here, "spacing"), f"must be at least the largest diameter, {diameter:g} m")
@@ -163,7 +159,7 @@ def _extents(scenario: Scenario) -> dict[int, Extent]:
     for index, group in enumerate(scenario.bodies):
         region = group.placement.jittered_grid
         if region is not None and group.count is not None:
-            radius = largest_radius(group)
+            radius = largest_reach(group)
             extents[index] = Extent(*grid(region, group.count, radius).bounds(group.count, radius))
     return extents
 
@@ -226,11 +222,11 @@ def _length(extent: Extent) -> float:
 def _speed_doubts(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Finding]:
     """Bodies or walls that cross a radius within one step, so that contacts come too late."""
     step = scenario.time.step
-    radii = [smallest_radius(group) for group in scenario.bodies if group.radius is not None]
+    radii = [thinnest_half(group) for group in scenario.bodies if group.radius is not None]
     for index, group in enumerate(scenario.bodies):
         if group.radius is None:
             continue
-        radius = smallest_radius(group)
+        radius = thinnest_half(group)
         speed = _speed_reached(scenario, group, extents.get(index))
         if speed * step > radius:
             rule = (

@@ -24,6 +24,7 @@ _BOUNDS = {
     "string_too_short": ("min_length", "must have at least {} character(s)"),
     "string_too_long": ("max_length", "must have at most {} characters"),
 }
+_UNION_MEMBERS = {"<number>", "<list>", "<uniform>", "<lognormal>", "<weighted>", "<mix>"}
 _KINDS = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -65,8 +66,11 @@ def explain(error: ValidationError, document: Document, schema: Schema) -> Input
     A misspelt required key makes two findings; the misspelling is the one to name.
     """
     order = {"extra_forbidden": 0, "missing": 2}
+    findings = error.errors(include_url=False, include_context=True)
+    # A list none of whose items is right counts as too short as well.
+    wrong = [finding["loc"] for finding in findings]
     first = min(
-        error.errors(include_url=False, include_context=True),
+        (f for f in findings if not (f["type"] == "too_short" and _holds(f["loc"], wrong))),
         key=lambda finding: order.get(finding["type"], 1),
     )
     path = _without_tags(first["loc"])
@@ -77,12 +81,17 @@ def explain(error: ValidationError, document: Document, schema: Schema) -> Input
     return InputError(message(document, path, _rule(first, path, document, schema)))
 
 
+def _holds(location: tuple, others: Iterable[tuple]) -> bool:
+    """Whether something else stands inside what is at `location`."""
+    depth = len(location)
+    return any(len(other) > depth and other[:depth] == location for other in others)
+
+
 def _without_tags(location: tuple[str | int, ...]) -> KeyPath:
     """Pydantic's location without the names of union members and the marks of dict keys."""
     if location[:1] == ("walls",) and len(location) > 2:
         location = location[:2] + location[3:]
-    unions = ("<number>", "<list>", "<uniform>")
-    return tuple(key for key in location if key not in unions and key != "[key]")
+    return tuple(key for key in location if key not in _UNION_MEMBERS and key != "[key]")
 
 
 def _rule(finding: Any, path: KeyPath, document: Document, schema: Schema) -> str:
@@ -184,7 +193,13 @@ def _home(model: str) -> str:
         "BodyGroup": "bodies[i]",
         "JitteredGrid": "bodies[i].placement.jittered_grid",
         "Placement": "bodies[i].placement",
+        "RandomPlacement": "bodies[i].placement.random",
+        "Insertion": "bodies[i].placement.insertion",
         "UniformRadius": "bodies[i].radius",
+        "Lognormal": "bodies[i].radius.lognormal",
+        "Weighted": "bodies[i].radius.weighted",
+        "Mix": "bodies[i].radius.mix",
+        "Removal": "removal[i]",
         "PlaneWall": "walls[i]",
         "BoxWall": "walls[i]",
         "Motion": "walls[i].motion",

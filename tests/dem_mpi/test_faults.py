@@ -624,7 +624,7 @@ class Crowd(Parallel):
 def test_counts_of_a_step_pass_32_bits():
     scenario = parse_scenario(PILE, "scene.yaml").scenario
     crowd = Crowd(MPI.COMM_SELF)
-    arrays = place(scenario, 0, 1)
+    arrays = place(Parallel.alone(), scenario)
     simulation = Simulation(
         crowd, scenario, start(Parallel.alone(), Bodies.from_arrays(arrays, [2500.0]))
     )

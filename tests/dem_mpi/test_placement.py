@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dem_mpi.errors import DataError, InputError
-from dem_mpi.placement import grid, place
+from dem_mpi.placement import grid, place_share
 from dem_mpi.scenario import Scenario, body_count, load_scenario, parse_scenario
 from dem_mpi.scene_bodies import JitteredGrid
 
@@ -47,8 +47,8 @@ def file_scene(directory: Path, name: str, extra: str = "radius: 0.1, ", within:
 @pytest.mark.parametrize("size", [2, 3, 8, 1000])
 def test_bodies_do_not_depend_on_the_number_of_ranks(size: int):
     scene = scenario(RANDOM_GROUP + REGULAR_GROUP)
-    whole = place(scene, 0, 1)
-    parts = [place(scene, rank, size) for rank in range(size)]
+    whole = place_share(scene, 0, 1)
+    parts = [place_share(scene, rank, size) for rank in range(size)]
     for key, array in whole.items():
         joined = np.concatenate([part[key] for part in parts])
         assert joined.dtype == array.dtype
@@ -58,13 +58,13 @@ def test_bodies_do_not_depend_on_the_number_of_ranks(size: int):
 
 def test_shares_differ_by_one_body_at_most():
     scene = scenario(RANDOM_GROUP)
-    counts = [len(place(scene, rank, 9)["gid"]) for rank in range(9)]
+    counts = [len(place_share(scene, rank, 9)["gid"]) for rank in range(9)]
     assert sum(counts) == 700
     assert max(counts) - min(counts) <= 1
 
 
 def test_arrays_have_the_stated_types_and_values():
-    bodies = place(scenario(RANDOM_GROUP + REGULAR_GROUP), 0, 1)
+    bodies = place_share(scenario(RANDOM_GROUP + REGULAR_GROUP), 0, 1)
     n = 730
     assert {key: (a.shape, a.dtype.name) for key, a in bodies.items()} == {
         "gid": ((n,), "int64"),
@@ -74,6 +74,8 @@ def test_arrays_have_the_stated_types_and_values():
         "velocity": ((n, 3), "float64"),
         "angular_velocity": ((n, 3), "float64"),
         "orientation": ((n, 4), "float64"),
+        "shape": ((n,), "int8"),
+        "half_length": ((n,), "float64"),
     }
     assert bodies["gid"].tolist() == list(range(n))
     assert bodies["material"].tolist() == [0] * 700 + [1] * 30
@@ -83,7 +85,7 @@ def test_arrays_have_the_stated_types_and_values():
 
 
 def test_random_radii_and_velocities_fill_their_ranges_evenly():
-    bodies = place(scenario(RANDOM_GROUP), 0, 1)
+    bodies = place_share(scenario(RANDOM_GROUP), 0, 1)
     # The mean of n uniform numbers of range w has standard deviation w / sqrt(12 n).
     for values, low, high in (
         (bodies["radius"], 0.005, 0.01),
@@ -98,7 +100,7 @@ def test_random_radii_and_velocities_fill_their_ranges_evenly():
 
 def test_random_numbers_are_fixed_for_all_time():
     """A stored scene must give the same bodies under every version of the libraries."""
-    bodies = place(scenario(RANDOM_GROUP), 0, 1)
+    bodies = place_share(scenario(RANDOM_GROUP), 0, 1)
     counter = np.random.Philox(key=np.array([7, 0], dtype=np.uint64)).random_raw(8)
     expected = 0.005 + 0.005 * (int(counter[3]) >> 11) * 2.0**-53
     assert bodies["radius"][0] == pytest.approx(expected, rel=1e-15)
@@ -109,15 +111,15 @@ PHILOX_7_0 = ["df4034b829e9fba4", "4b9d10cdf8e64087"]
 
 
 def test_seed_changes_every_random_number():
-    first = place(scenario(RANDOM_GROUP), 0, 1)
+    first = place_share(scenario(RANDOM_GROUP), 0, 1)
     text = (HEAD + RANDOM_GROUP).replace("seed: 7", "seed: 8")
-    second = place(parse_scenario(text, "s").scenario, 0, 1)
+    second = place_share(parse_scenario(text, "s").scenario, 0, 1)
     assert (first["position"] != second["position"]).all()
     assert (first["radius"] != second["radius"]).all()
 
 
 def test_full_jitter_cannot_make_bodies_overlap_or_leave_the_region():
-    bodies = place(scenario(RANDOM_GROUP.replace("700", "3000")), 0, 1)
+    bodies = place_share(scenario(RANDOM_GROUP.replace("700", "3000")), 0, 1)
     position, radius = bodies["position"], bodies["radius"]
     for start in range(0, 3000, 500):
         block = slice(start, start + 500)
@@ -139,7 +141,7 @@ def test_densest_grid_touches_and_does_not_overlap():
 
 
 def test_layers_fill_from_the_bottom():
-    height = place(scenario(REGULAR_GROUP.replace("30", "250")), 0, 1)["position"][:, 2]
+    height = place_share(scenario(REGULAR_GROUP.replace("30", "250")), 0, 1)["position"][:, 2]
     assert (np.diff(height) >= 0).all()
     levels, counts = np.unique(height, return_counts=True)
     np.testing.assert_allclose(levels, [0.55, 0.65, 0.75], rtol=1e-12)
@@ -174,7 +176,60 @@ def test_placing_more_than_fits_is_refused_even_without_loading_a_file():
     data = parse_scenario(HEAD + REGULAR_GROUP, "s").effective
     data["bodies"][0]["count"] = 10_000
     with pytest.raises(InputError, match="only 500 fit"):
-        place(Scenario.model_validate(data), 0, 1)
+        place_share(Scenario.model_validate(data), 0, 1)
+
+
+# --- bodies that are not spheres -------------------------------------------------------------
+
+RODS = """\
+  - {material: glass, shape: spherocylinder, aspect_ratio: 2.5, count: 4000, axis: AXIS,
+     radius: {uniform: [0.005, 0.01]}, placement: {jittered_grid: {min: [0, 0, 0], max: [1, 1, 1]}}}
+"""
+
+
+def axes(orientation: np.ndarray) -> np.ndarray:
+    """The body's z axis (n, 3) in the world."""
+    w, x, y, z = orientation.T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x**2 + y**2)], axis=1)
+
+
+@pytest.mark.parametrize(
+    "axis",
+    [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0, -3, 0), (1, 2, 3), (1e-9, 0, -1), (1, 1e-20, -1e-3)],
+)
+def test_bodies_point_where_their_group_says(axis: tuple[float, float, float]):
+    bodies = place_share(scenario(RODS.replace("AXIS", f"{list(axis)}")), 0, 1)
+    direction = np.array(axis) / np.linalg.norm(axis)
+    np.testing.assert_allclose(axes(bodies["orientation"])[0], direction, rtol=0, atol=4e-16)
+    assert np.ptp(bodies["orientation"], axis=0).max() == 0
+
+
+def test_random_directions_cover_the_sphere_evenly_and_leave_other_numbers_alone():
+    bodies = place_share(scenario(RODS.replace("AXIS", "random")), 0, 1)
+    upright = place_share(scenario(RODS.replace("AXIS", "[0, 0, 1]")), 0, 1)
+    for key in ("radius", "position"):
+        assert (bodies[key] == upright[key]).all()
+    n = len(bodies["gid"])
+    np.testing.assert_allclose(np.linalg.norm(bodies["orientation"], axis=1), 1, atol=1e-15)
+    axis = axes(bodies["orientation"])
+    # Uniform on the sphere: <a> = 0, <a a> = 1/3, each component uniform on [-1, 1].
+    assert np.abs(axis.mean(axis=0)).max() < 5 / np.sqrt(3 * n)
+    assert np.abs(axis.T @ axis / n - np.eye(3) / 3).max() < 5 * np.sqrt(4 / 45 / n)
+    for column in axis.T:
+        counts = np.histogram(column, bins=20, range=(-1, 1))[0]
+        assert ((counts - n / 20) ** 2 / (n / 20)).sum() < 44  # chi-square, 19 degrees, p = 1e-3
+
+
+def test_shape_and_length_follow_from_the_aspect_ratio_and_keep_grid_bodies_apart():
+    rods = place_share(scenario(RODS.replace("AXIS", "random")), 0, 1)
+    assert (rods["shape"] == 1).all()
+    np.testing.assert_allclose(rods["half_length"], 1.5 * rods["radius"], rtol=1e-15)
+    spheroids = RODS.replace("spherocylinder", "spheroid").replace("AXIS", "random")
+    bodies = place_share(scenario(spheroids), 0, 1)
+    assert (bodies["shape"] == 2).all()
+    np.testing.assert_allclose(bodies["half_length"], 2.5 * bodies["radius"], rtol=1e-15)
+    with pytest.raises(InputError, match="too thin for bodies"):
+        scenario(RODS.replace("AXIS", "random").replace("max: [1, 1, 1]", "max: [0.04, 1, 1]"))
 
 
 # --- files ----------------------------------------------------------------------------------
@@ -185,7 +240,7 @@ def test_csv_columns_may_stand_in_any_order_and_replace_the_scene_s_values(tmp_p
     (tmp_path / "bodies.csv").write_text(rows)
     loaded = load_scenario(file_scene(tmp_path, "bodies.csv"))
     assert body_count(loaded.scenario) == loaded.effective["bodies"][0]["count"] == 2
-    bodies = place(loaded.scenario, 0, 1)
+    bodies = place_share(loaded.scenario, 0, 1)
     assert bodies["position"].tolist() == [[1, 2, 3], [10, 20, 30]]
     assert bodies["radius"].tolist() == [0.5, 0.25]
     assert bodies["velocity"].tolist() == [[7, 8, 9], [-7, -8, -9]]
@@ -204,15 +259,15 @@ def test_ranks_read_their_own_rows(tmp_path: Path, kind: str):
             file["start/position"] = position
     within = "start" if kind == "h5" else ""
     scene = load_scenario(file_scene(tmp_path, f"b.{kind}", within=within)).scenario
-    parts = [place(scene, rank, 7)["position"] for rank in range(7)]
+    parts = [place_share(scene, rank, 7)["position"] for rank in range(7)]
     assert np.concatenate(parts).tobytes() == position.tobytes()
-    assert len(place(scene, 1, 1000)["gid"]) == 0
+    assert len(place_share(scene, 1, 1000)["gid"]) == 0
 
 
 def test_count_takes_the_first_rows_of_a_file(tmp_path: Path):
     (tmp_path / "b.csv").write_text("x,y,z\n0,0,0\n1,0,0\n2,0,0\n")
     scene = file_scene(tmp_path, "b.csv", "radius: 0.1, count: 2, ")
-    assert len(place(load_scenario(scene).scenario, 0, 1)["gid"]) == 2
+    assert len(place_share(load_scenario(scene).scenario, 0, 1)["gid"]) == 2
     with pytest.raises(InputError, match=r"scene.yaml:6: bodies\[0\].count = 4: .* holds 3 bodies"):
         load_scenario(file_scene(tmp_path, "b.csv", "radius: 0.1, count: 4, "))
 
@@ -245,7 +300,7 @@ def test_damaged_csv_is_refused(tmp_path: Path, content: str | bytes, words: str
     data = content.encode() if isinstance(content, str) else content
     (tmp_path / "b.csv").write_bytes(data)
     with pytest.raises(DataError, match=words) as caught:
-        place(load_scenario(file_scene(tmp_path, "b.csv")).scenario, 0, 1)
+        place_share(load_scenario(file_scene(tmp_path, "b.csv")).scenario, 0, 1)
     assert "\n" not in str(caught.value)
     assert caught.value.exit_code == 65
 
@@ -332,7 +387,7 @@ def test_hostile_or_damaged_hdf5_is_refused(tmp_path: Path, make, words: str):
     with h5py.File(tmp_path / "b.h5", "w") as file:
         make(file)
     with pytest.raises(DataError, match=words):
-        place(load_scenario(file_scene(tmp_path, "b.h5")).scenario, 0, 1)
+        place_share(load_scenario(file_scene(tmp_path, "b.h5")).scenario, 0, 1)
 
 
 @pytest.mark.parametrize("size", [0, 10, 300])

@@ -230,7 +230,7 @@ def test_override_error_names_the_override_instead_of_a_line():
             "friction.pairs=[{between: [glass, steel], mu: 1}, {between: [steel, glass], mu: 2}]",
             "already in friction.pairs[0]",
         ),
-        ("walls.0.shape=bax", 'walls[0].shape = "bax": must be one of plane, box. Did you mean'),
+        ("walls.0.shape=bax", 'walls[0].shape = "bax": must be one of plane, box, rectangle'),
         ("walls.0.nam=box", "Did you mean 'name'?"),
         ("walls.0.open=[z_mux]", "Did you mean 'z_max'?"),
         ("walls.0.motion.velocity=1", "walls[0].motion.velocity = 1: must be a list"),

@@ -96,7 +96,7 @@ def state_of(
 
 def placed(parallel: Parallel, scenario: Scenario) -> State:
     """Collective. The bodies as the scene places them."""
-    arrays = place(scenario, parallel.rank, parallel.size)
+    arrays = place(parallel, scenario)
     return _started(parallel, scenario, Bodies.from_arrays(arrays, [DENSITY]))
 
 
