@@ -455,6 +455,8 @@ def open_checked(path: Path | str) -> h5py.File:
 
 def _check_group(path: Path, group: h5py.Group, seen: set[int]) -> None:
     for name in group:
+        if isinstance(name, bytes):  # what h5py gives where a name is no UTF-8
+            raise DataError(f"{path}: damaged: a name in '{group.name}' is not text")
         place = f"{group.name.rstrip('/')}/{name}"
         link = group.id.links.get_info(name.encode())
         if link.type != h5l.TYPE_HARD:
