@@ -2,25 +2,27 @@
 
 D_i maps the impulse (gamma_n, gamma_1, gamma_2) of contact i to generalised impulses, + on body b,
 - on body a. Rows of D^T are this rank's contacts; its columns are bodies, (v, w) each in a scene
-with friction and v alone without.
+with friction or with bodies that are not spheres, and v alone in one of spheres without friction.
+
+Spheres have arms (m, 2) along the normal and inverse inertias (n + g,). General bodies have arms
+(m, 6) to the contact point and inverse inertias (n + g, 6) in the world frame: xx, xy, xz, yy, yz,
+zz. The shape of the arms tells which loops are used.
 
 Both forms compute the same product; the matrix-free one moves a tenth of the bytes.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dem_mpi import _kernels_rigid as rigid
 from dem_mpi import _kernels_solver as kernels
 from dem_mpi.contacts import ContactSet
 from dem_mpi.errors import DemError
 from dem_mpi.parallel import Halo, Parallel
-
-if TYPE_CHECKING:
-    from petsc4py import PETSc
 
 
 class MatrixFree:
@@ -29,7 +31,8 @@ class MatrixFree:
     Owned: contacts and the first `halo.owned` bodies. Ghost rows of the work arrays are current
     after every `body_velocity`.
 
-    inverse_mass, inverse_inertia : (n + g,) [1/kg], [1/(kg m^2)]; ghosts current.
+    inverse_mass, inverse_inertia : (n + g,) [1/kg] and (n + g,) or (n + g, 6) [1/(kg m^2)];
+                                    ghosts current.
     """
 
     def __init__(
@@ -51,11 +54,12 @@ class MatrixFree:
         self._second = np.empty(contacts.count, dtype=np.int32)
         kernels.incidence(contacts.b, bodies, self._start, self._second)
         self._world = np.empty((contacts.count, 3))
-        self._u = np.zeros((bodies, 6 if frictional else 3))
+        self._u = np.zeros((bodies, _freedoms(contacts, frictional)))
+        self._threads = threads
+        loops = rigid if _is_general(contacts) else kernels
         self._to_world = kernels.to_world.using(threads)
-        self._to_bodies = kernels.impulses_to_bodies.using(threads)
-        self._to_contacts = kernels.bodies_to_contacts.using(threads)
-        self._diagonal = kernels.diagonal.using(threads)
+        self._to_bodies = loops.impulses_to_bodies.using(threads)
+        self._to_contacts = loops.bodies_to_contacts.using(threads)
 
     def body_velocity(self, impulse: NDArray) -> NDArray:
         """Collective. u = M^-1 D impulse, (n + g, 6 or 3); a view that the next call overwrites."""
@@ -80,10 +84,9 @@ class MatrixFree:
 
     def diagonal(self) -> NDArray:
         """Return the diagonal of N, (m, columns) [1/kg]."""
-        c = self.contacts
-        diag = np.empty((c.count, self.columns))
-        self._diagonal(c.arm, c.a, c.b, self._inverse_mass, self._inverse_inertia, diag)
-        return diag
+        return _diagonal(
+            self.contacts, self.columns, self._inverse_mass, self._inverse_inertia, self._threads
+        )
 
     def destroy(self) -> None:
         """Nothing to free: numpy owns all of it."""
@@ -111,7 +114,7 @@ class Assembled:
         self._petsc = PETSc
         self.contacts = contacts
         self.columns = 3 if frictional else 1
-        self._dof = 6 if frictional else 3
+        self._dof = _freedoms(contacts, frictional)
         self._halo = halo
         self._parallel = parallel
         owned = halo.owned
@@ -120,24 +123,28 @@ class Assembled:
         columns = np.zeros(inverse_mass.shape[0], dtype=np.int64)
         columns[:owned] = first + np.arange(owned)
         halo.forward(columns)
+        self._first_column = first * self._dof
         self._body_columns = (columns * self._dof).astype(self._petsc.IntType)
         comm = parallel.communicator
         csr = self._rows(contacts)
         sizes = ((contacts.count * self.columns, None), (owned * self._dof, None))
         self.d_transposed = self._petsc.Mat().createAIJ(sizes, csr=csr, comm=comm)
-        self.inverse_mass = self._mass_matrix(inverse_mass, inverse_inertia, owned, first, comm)
-        self._diag = np.empty((contacts.count, self.columns))
-        kernels.diagonal.serial(
-            contacts.arm, contacts.a, contacts.b, inverse_mass, inverse_inertia, self._diag
-        )
+        sizes = ((owned * self._dof, None), (owned * self._dof, None))
+        self._body_mass = inverse_mass
+        csr = self._mass_rows(inverse_inertia)
+        self.inverse_mass = self._petsc.Mat().createAIJ(sizes, csr=csr, comm=comm)
+        self._diag = _diagonal(contacts, self.columns, inverse_mass, inverse_inertia)
         self._gamma, self._g = self.d_transposed.createVecs(side="left"), None
         self._g = self._gamma.duplicate()
         self._w = self.d_transposed.createVecs(side="right")
         self._u = self._w.duplicate()
         self._local = np.zeros((inverse_mass.shape[0], self._dof))
 
-    def refill(self, contacts: ContactSet) -> bool:
-        """Collective. Take new geometry on the same contact graph; False if the graph changed."""
+    def refill(self, contacts: ContactSet, inverse_inertia: NDArray | None = None) -> bool:
+        """Collective. Take new geometry on the same contact graph; False if the graph changed.
+
+        General bodies turn their inertias with them, and give `inverse_inertia` (n + g, 6) anew.
+        """
         same = contacts.same_graph(self.contacts)
         if not self._parallel.min(int(same)):
             return False
@@ -145,33 +152,46 @@ class Assembled:
         indptr, indices, values = self._rows(contacts)
         self.d_transposed.setValuesCSR(indptr, indices, values)
         self.d_transposed.assemble()
+        if inverse_inertia is not None:
+            self.inverse_mass.setValuesCSR(*self._mass_rows(inverse_inertia))
+            self.inverse_mass.assemble()
+            self._diag = _diagonal(contacts, self.columns, self._body_mass, inverse_inertia)
         return True
 
     def _rows(self, contacts: ContactSet) -> tuple[NDArray, NDArray, NDArray]:
-        m, dof = contacts.count, self._dof
-        walls = int(np.count_nonzero(contacts.b < 0))
-        a_side = 3 + 2 * 6 if dof == 6 else 3
-        size = (2 * m - walls) * a_side
-        indptr = np.zeros(m * self.columns + 1, dtype=self._petsc.IntType)
-        indices = np.empty(size, dtype=self._petsc.IntType)
-        values = np.empty(size)
-        kernels.assembled_rows(
-            contacts.normal, contacts.arm, contacts.a, contacts.b, dof, self._body_columns,
-            indptr, indices, values,
+        general = _is_general(contacts)
+        sides = 2 * contacts.count - int(np.count_nonzero(contacts.b < 0))
+        if general:
+            entries = 6 * self.columns
+        else:
+            entries = 3 + 2 * 6 if self._dof == 6 else 3
+        indptr = np.zeros(contacts.count * self.columns + 1, dtype=self._petsc.IntType)
+        indices = np.empty(sides * entries, dtype=self._petsc.IntType)
+        values = np.empty(sides * entries)
+        write = rigid.assembled_rows if general else kernels.assembled_rows
+        write(
+            contacts.normal, contacts.arm, contacts.a, contacts.b,
+            self.columns if general else self._dof, self._body_columns, indptr, indices, values,
         )  # fmt: skip
         return indptr, indices, values
 
-    def _mass_matrix(self, inverse_mass, inverse_inertia, owned, first, comm) -> PETSc.Mat:
-        dof = self._dof
+    def _mass_rows(self, inverse_inertia: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        """Rows of M^-1: diagonal, or for general bodies with a 3 x 3 block for the rotation."""
+        owned, dof, index = self._halo.owned, self._dof, self._petsc.IntType
+        mass = self._body_mass[:owned]
+        if inverse_inertia.ndim == 2:
+            indices, values = np.empty((owned, 12), index), np.empty((owned, 12))
+            rigid.mass_rows(mass, inverse_inertia, indices, values)
+            indices += self._first_column
+            lengths = np.tile([1, 1, 1, 3, 3, 3], owned)
+            indptr = np.concatenate(([0], np.cumsum(lengths))).astype(index)
+            return indptr, indices.ravel(), values.ravel()
         entries = np.empty((owned, dof))
-        entries[:, :3] = inverse_mass[:owned, None]
+        entries[:, :3] = mass[:, None]
         if dof == 6:
             entries[:, 3:] = inverse_inertia[:owned, None]
-        rows = owned * dof
-        indptr = np.arange(rows + 1, dtype=self._petsc.IntType)
-        indices = (first * dof + np.arange(rows)).astype(self._petsc.IntType)
-        sizes = ((rows, None), (rows, None))
-        return self._petsc.Mat().createAIJ(sizes, csr=(indptr, indices, entries.ravel()), comm=comm)
+        rows = np.arange(owned * dof + 1, dtype=index)
+        return rows, (self._first_column + rows[:-1]).astype(index), entries.ravel()
 
     def body_velocity(self, impulse: NDArray) -> NDArray:
         """Collective. u = M^-1 D impulse, (n + g, 6 or 3); ghosts current."""
@@ -205,6 +225,29 @@ class Assembled:
         """Collective. Free every PETSc object this operator made."""
         for item in (self.d_transposed, self.inverse_mass, self._gamma, self._g, self._w, self._u):
             item.destroy()
+
+
+def _is_general(contacts: ContactSet) -> bool:
+    """Whether bodies may be other than spheres."""
+    return contacts.arm.shape[1] == 6
+
+
+def _freedoms(contacts: ContactSet, frictional: bool) -> int:
+    """Degrees of freedom of a body: 3 only where no contact can turn it."""
+    return 6 if frictional or _is_general(contacts) else 3
+
+
+def _diagonal(
+    c: ContactSet, columns: int, inverse_mass: NDArray, inverse_inertia: NDArray, threads: int = 1
+) -> NDArray:
+    """Return the diagonal of N, (m, columns) [1/kg]."""
+    diag = np.empty((c.count, columns))
+    bodies = (c.a, c.b, inverse_mass, inverse_inertia, diag)
+    if _is_general(c):
+        rigid.diagonal.using(threads)(c.normal, c.arm, *bodies)
+    else:
+        kernels.diagonal.using(threads)(c.arm, *bodies)
+    return diag
 
 
 def _check_index_width(parallel: Parallel, columns: int, rows: int, petsc: Any) -> None:

@@ -28,15 +28,6 @@ def sphere_volume(radius: NDArray) -> NDArray:
     return 4.0 / 3.0 * np.pi * radius**3
 
 
-def half_length_of(shape: int, radius: NDArray, aspect_ratio: float) -> NDArray:
-    """Return l (n,) [m] of bodies of one shape; `aspect_ratio` = length along the axis / width."""
-    if shape == SPHEROCYLINDER:
-        return (aspect_ratio - 1.0) * radius
-    if shape == SPHEROID:
-        return aspect_ratio * radius
-    return np.zeros_like(radius)
-
-
 def volume(shape: NDArray, radius: NDArray, half_length: NDArray) -> NDArray:
     """V [m³] of bodies (n,): of a spherocylinder 4/3 π r³ + 2 π r² l, of a spheroid 4/3 π r² l."""
     result = sphere_volume(radius)
