@@ -237,13 +237,11 @@ def wall_impulses(x, a, b, normal, arm, p, reference, out):
 
     The point of a contact is x_a + arm n, or x_a + arm where arms are vectors.
 
-    x : (n, 3) positions from which the contacts were found; a, b : (m,) rows of contacts;
+    x : (n, 3) positions from which the contacts were found; a, b : (m,) rows, b = -(k + 1);
     p : (m, 3) world impulses on b; reference : (w, 3) [m]; out : (w, 6), zeros on entry.
     """
     along = arm.shape[1] == 2
     for i in range(b.shape[0]):
-        if b[i] >= 0:
-            continue
         k = -b[i] - 1
         if along:
             lx, ly, lz = (

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from dem_mpi import _kernels_detection as kernels
 from dem_mpi import _kernels_solver as frames
+from dem_mpi import _kernels_walls as wall_kernels
 from dem_mpi.bodies import Bodies, ImpulseMemory
 from dem_mpi.errors import DemError
 from dem_mpi.parallel import Halo, Parallel
@@ -370,10 +371,30 @@ def contact_velocity_of_walls(
         return None
     velocity = np.zeros((contacts.count, 3))
     rows = np.flatnonzero(contacts.b < 0)
-    arm = contacts.arm[rows, :1] * contacts.normal[rows]
+    arm = contacts.arm[rows]
+    arm = arm[:, :1] * contacts.normal[rows] if arm.shape[1] == 2 else arm[:, :3]
     point = position[contacts.a[rows]] + arm
     velocity[rows] = velocity_at(walls, -contacts.b[rows] - 1, point)
     return velocity
+
+
+def wall_impulses(
+    contacts: ContactSet, position: NDArray, walls: Walls, impulse: NDArray
+) -> NDArray:
+    """Return the impulse [N s] and torque impulse [N m s] of these contacts on each face, (w, 6).
+
+    Torques are about the `centre` of each face. position : (n, 3) of the owned bodies, from which
+    the contacts were found; impulse : (m, columns).
+    """
+    total = np.zeros((len(walls.kind), 6))
+    if not len(total):
+        return total
+    rows = np.flatnonzero(contacts.b < 0)
+    a, b, normal, arm = (x[rows] for x in (contacts.a, contacts.b, contacts.normal, contacts.arm))
+    world = np.empty((len(rows), 3))
+    frames.to_world.serial(normal, np.ascontiguousarray(impulse[rows]), world)
+    wall_kernels.wall_impulses(position, a, b, normal, arm, world, walls.centre, total)
+    return total
 
 
 def recall_impulses(

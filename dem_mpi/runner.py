@@ -286,6 +286,8 @@ class Run:
         seconds = self._parallel.max(timer.step)
         memory = self._parallel.max(resident_memory())
         line = asdict(record)
+        if not record.walls:
+            del line["walls"]
         line["seconds"] = {
             name: round(float(s), 6) for name, s in zip(PHASES, seconds, strict=True)
         }

@@ -20,18 +20,21 @@ from dem_mpi.contacts import (
     ContactSet,
     DetectionOptions,
     Neighbours,
+    PeriodTooShortError,
     Reference,
     contact_velocity_of_walls,
     find_contacts,
     find_neighbours,
     recall_impulses,
     remember_impulses,
+    wall_impulses,
 )
 from dem_mpi.errors import DemError
 from dem_mpi.metrics import PhaseTimer
 from dem_mpi.operators import Assembled, MatrixFree
 from dem_mpi.parallel import Parallel
 from dem_mpi.partition import balance, imbalance, migrate
+from dem_mpi.periodic import AXES, PeriodicBox
 from dem_mpi.scenario import Scenario, friction_table, frictional
 from dem_mpi.solvers.apgd import Apgd, ApgdOptions
 from dem_mpi.solvers.result import SolveReport
@@ -60,6 +63,8 @@ class StepRecord:
 
     energy_change is KE(v+) - KE(v_hat), energy_balance the same from the contact side:
     -gamma.N gamma/2 + gamma.g - sum gamma_n b_phi - gamma.b_wall; the two agree to round-off.
+    wall_work is -gamma.b_wall, what the walls do on the bodies. walls holds by name the mean force
+    [N] on each face, and its torque [N m] about the centre of its rotation or else its point.
     """
 
     step: int
@@ -81,6 +86,8 @@ class StepRecord:
     largest_speed: float
     energy_change: float
     energy_balance: float
+    wall_work: float
+    walls: dict[str, list[float]]
     overlap: float
     coincident: int
     outside: int
@@ -103,12 +110,13 @@ class _Posed:
     predicted: NDArray
     b_gap: NDArray
     b_wall: NDArray | None
+    walls: Walls
     overlap: float
 
 
 @dataclass(frozen=True)
 class _Substep:
-    """A solved but not yet accepted step of length h."""
+    """A solved but not yet accepted step of length h; wall_impulse (w, 6) as in `State`."""
 
     step: float
     contacts: ContactSet
@@ -119,6 +127,8 @@ class _Substep:
     energy_before: float
     energy_after: float
     energy_balance: float
+    wall_work: float
+    wall_impulse: NDArray
     overlap: float
 
     @property
@@ -139,6 +149,8 @@ class Simulation:
         self._columns = 3 if self.frictional else 1
         self._gravity = np.array(scenario.gravity)
         self._faces = wall_faces(scenario)
+        if state.wall_impulse.shape[0] != len(self._faces.name):
+            state.wall_impulse, state.wall_time = np.zeros((len(self._faces.name), 6)), 0.0
         contact = scenario.contact
         self._detection = self._detection_options()
         self._tolerance = Tolerance(
@@ -170,6 +182,8 @@ class Simulation:
         time = state.step * h
         done = self._advance(time, h)
         state.step += 1
+        state.wall_impulse = state.wall_impulse + sum(s.wall_impulse for s in done)
+        state.wall_time += h
         outside = self._leave_domain()
         record = self._record(done, outside, self.parallel.bytes_sent - sent)
         if not record.converged:
@@ -212,11 +226,15 @@ class Simulation:
             new_spin = spin + u[:, 3:] if self.frictional else spin
             before = integrator.kinetic_energy(bodies, posed.predicted, spin)
             after = integrator.kinetic_energy(bodies, new_velocity, new_spin)
-            balance_terms = _energy_balance(posed.problem, report, posed.b_gap, posed.b_wall)
-            sums = self.parallel.sum(np.array([before, after, balance_terms]))
+            work = 0.0 if posed.b_wall is None else -float(np.sum(report.impulse * posed.b_wall))
+            balance_terms = _energy_balance(posed.problem, report, posed.b_gap, work)
+            reaction = wall_impulses(posed.contacts, bodies.position, posed.walls, report.impulse)
+            sums = np.concatenate(([before, after, balance_terms, work], reaction.ravel()))
+            self.parallel.sum_in_place(sums)
         return _Substep(
             h, posed.contacts, report, posed.problem, new_velocity, new_spin,
-            float(sums[0]), float(sums[1]), float(sums[2]), posed.overlap,
+            float(sums[0]), float(sums[1]), float(sums[2]), float(sums[3]),
+            sums[4:].reshape(reaction.shape), posed.overlap,
         )  # fmt: skip
 
     def pose(self) -> tuple[ConeProblem, NDArray]:
@@ -239,7 +257,7 @@ class Simulation:
         with timer.phase("contacts"):
             # v_hat = v + h M^-1 f_ext
             predicted = integrator.predict(bodies, self._gravity, h)
-            position = neighbours.extend(bodies.position)
+            position = neighbours.extend_position(bodies.position)
             velocity = neighbours.extend(predicted)
             spin = self._extend_spin(neighbours)
             contacts = find_contacts(
@@ -252,7 +270,7 @@ class Simulation:
             )
             self._check_runaway(contacts, overlap)
             guess = self._guess(contacts, h)
-        return _Posed(contacts, operator, problem, guess, predicted, b_gap, b_wall, overlap)
+        return _Posed(contacts, operator, problem, guess, predicted, b_gap, b_wall, walls, overlap)
 
     def _accept(self, substep: _Substep) -> None:
         """Collective. Give the bodies new velocities, move them, and remember the impulses."""
@@ -286,6 +304,7 @@ class Simulation:
             skin=contact.skin * self.parallel.min(smallest),
             friction=friction_table(self.scenario)[1],
             threads=self.scenario.threads,
+            box=PeriodicBox.of(self.scenario.domain),
         )
 
     def _update_neighbours(self, h: float) -> None:
@@ -299,13 +318,27 @@ class Simulation:
                     return
         self._rebuilt = True
         with self.timer.phase("partition"):
+            state.bodies.position = self.wrapped_position()
             self._repartition()
         with self.timer.phase("neighbours"):
             predicted = integrator.predict(state.bodies, self._gravity, h)
             state.reference = Reference.of(self.parallel, state.bodies, predicted, options, h)
-            self._neighbours = find_neighbours(
-                self.parallel, state.partition, state.bodies, state.reference, options
-            )
+            try:
+                self._neighbours = find_neighbours(
+                    self.parallel, state.partition, state.bodies, state.reference, options
+                )
+            except PeriodTooShortError as error:
+                self.forget_neighbours()
+                raise SolverFailureError(f"step {state.step + 1}: {error}") from None
+
+    def wrapped_position(self) -> NDArray:
+        """Positions (n, 3) [m] of this rank's bodies within the periodic box.
+
+        Between two lists of near pairs bodies move past the faces of the box, so that lists and
+        displacements stay valid.
+        """
+        position, box = self.state.bodies.position, self._detection.box
+        return position if box is None else box.wrap(position)
 
     def _repartition(self) -> None:
         """Collective. Send strayed bodies home; move the splitters if the load asks for it."""
@@ -335,7 +368,9 @@ class Simulation:
         """Collective. Count bodies whose centre is outside the domain, and remove them if asked."""
         state, domain = self.state, self.scenario.domain
         position = state.bodies.position
-        inside = np.all((position >= domain.min) & (position <= domain.max), axis=1)
+        within = (position >= domain.min) & (position <= domain.max)
+        within[:, [axis in domain.periodic for axis in AXES]] = True
+        inside = within.all(axis=1)
         outside = self.parallel.sum(int(np.count_nonzero(~inside)))
         if outside and domain.on_leave == "remove":
             stay = np.flatnonzero(inside)
@@ -534,6 +569,8 @@ class Simulation:
             largest_speed=motion.largest_speed,
             energy_change=sum(s.energy_after - s.energy_before for s in done),
             energy_balance=sum(s.energy_balance for s in done),
+            wall_work=sum(s.wall_work for s in done),
+            walls=self._wall_forces(done),
             overlap=max(s.overlap for s in done),
             coincident=int(counts[1]),
             outside=outside,
@@ -544,6 +581,21 @@ class Simulation:
             imbalance=imbalance(parallel, load),
             bytes_sent=int(counts[3]),
         )
+
+    def _wall_forces(self, done: list[_Substep]) -> dict[str, list[float]]:
+        """Mean force and torque on each face over a step."""
+        mean = sum(s.wall_impulse for s in done) / self.scenario.time.step
+        return dict(zip(self._faces.name, mean.tolist(), strict=True))
+
+    def take_wall_impulse(self) -> tuple[NDArray, float]:
+        """Return what the faces took since the last call, and begin anew.
+
+        Their impulses (w, 6) [N s, N m s], as in `State`, and the time [s] in which they came.
+        """
+        state = self.state
+        taken = state.wall_impulse, state.wall_time
+        state.wall_impulse, state.wall_time = np.zeros_like(state.wall_impulse), 0.0
+        return taken
 
     def destroy(self) -> None:
         """Collective. Free the PETSc objects."""
@@ -570,11 +622,11 @@ def redistribute(parallel: Parallel, state: State) -> State:
 
 
 def _energy_balance(
-    problem: ConeProblem, report: SolveReport, b_gap: NDArray, b_wall: NDArray | None
+    problem: ConeProblem, report: SolveReport, b_gap: NDArray, wall_work: float
 ) -> float:
-    """-gamma.N gamma/2 + gamma.g - sum gamma_n b_phi - gamma.b_wall of this rank's contacts [J]."""
+    """-gamma.N gamma/2 + gamma.g - sum gamma_n b_phi + wall work of this rank's contacts [J]."""
     gamma = report.impulse
     work = float(np.sum(gamma * report.velocity))
     push = float(np.sum(gamma * problem.b))
     total = -0.5 * (work - push) + work - float(np.sum(gamma[:, 0] * b_gap))
-    return total - (float(np.sum(gamma * b_wall)) if b_wall is not None else 0.0)
+    return total + wall_work

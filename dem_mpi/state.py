@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dem_mpi import checkpoint
 from dem_mpi.bodies import FIELDS, Bodies, ImpulseMemory
@@ -31,6 +32,8 @@ class State:
     deepest     : overlap that the run started with, in radii of the smaller body
     rotating    : whether orientations change at all
     balanced    : imbalance that the last new splitters reached
+    wall_impulse: (w, 6) impulse [N s] and torque impulse [N m s] that each face took, on all ranks
+    wall_time   : time [s] in which it did, since they were last taken for output
     flagged     : steps that missed their tolerance; removed : bodies that left the domain
     """
 
@@ -47,6 +50,8 @@ class State:
     removed: int = 0
     steps_at_rest: int = 0
     balanced: float = 1.0
+    wall_impulse: NDArray = field(default_factory=lambda: np.zeros((0, 6)))
+    wall_time: float = 0.0
 
 
 def save(
@@ -72,6 +77,7 @@ def save(
         "origin": partition.origin,
         "splitter_key": partition.splitter_key,
         "splitter_gid": partition.splitter_gid,
+        "wall_impulse": state.wall_impulse,
         "reference_frame": reference.frame if reference is not None else np.zeros(3),
     }
     attributes = {
@@ -88,6 +94,7 @@ def save(
         "removed": state.removed,
         "steps_at_rest": state.steps_at_rest,
         "balanced": state.balanced,
+        "wall_time": state.wall_time,
     }
     groups = {
         "bodies": bodies,
@@ -158,4 +165,6 @@ def _state_of(stored: checkpoint.Checkpoint, parallel: Parallel) -> State:
         removed=int(attributes["removed"]),
         steps_at_rest=int(attributes["steps_at_rest"]),
         balanced=float(attributes["balanced"]),
+        wall_impulse=shared["wall_impulse"],
+        wall_time=float(attributes["wall_time"]),
     )
