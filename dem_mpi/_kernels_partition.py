@@ -58,6 +58,8 @@ def find_ghost_targets(
 ):
     """Visit every rank r != `rank` whose region meets the box position ± reach of a body.
 
+    `rank` = -1 visits all: periodic images go to the rank of their body, too.
+
     The first pass has empty `rows` and counts: cursor[r] (P,) int64 goes up by the bodies of r.
     The second has cursor[r] at the first free place of r in `rows` and writes body numbers
     there, ascending. `occupied` (P,) bool marks the ranks that own a non-empty interval.
@@ -65,7 +67,7 @@ def find_ghost_targets(
     A region is the union of the lattice cells that its key interval touches. From the smallest
     octree cell around the box the octree is descended where a cell is cut by a splitter and by
     the surface of the box; both being thin, few cells are visited. Returns the number of bodies
-    whose key is not in the interval of `rank`.
+    whose key is not in the interval of `rank` (of -1, all).
     """
     strays = 0
     marked = np.full(len(occupied), -1, np.int64)

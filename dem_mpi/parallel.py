@@ -8,6 +8,7 @@ Symbols: P ranks; n owned rows; g ghost rows, stored behind the owned ones in ra
 
 from __future__ import annotations
 
+import itertools
 import pickle
 import sys
 import time
@@ -298,11 +299,19 @@ def _error_without_constructor(
     return error
 
 
+def _ascending_runs(index: NDArray) -> list[slice]:
+    """The slices between which `index` does not ascend: none holds a row twice."""
+    breaks = np.flatnonzero(np.diff(index) <= 0) + 1
+    ends = [0, *breaks.tolist(), len(index)]
+    return [slice(start, stop) for start, stop in itertools.pairwise(ends)]
+
+
 class Halo:
-    """Rows of owned bodies that other ranks hold as ghosts, and the way back.
+    """Rows of owned bodies that ranks hold as ghosts, and the way back.
 
     Local arrays have owned + ghosts rows. Ghost rows are grouped by owner in rank order, within
-    an owner in its local order, so every sum over ghosts has one fixed order.
+    an owner in the order in which it sends them, so every sum over ghosts has one fixed order. A
+    rank may hold several ghosts of one body, and ghosts of its own: periodic images.
     """
 
     def __init__(
@@ -316,6 +325,7 @@ class Halo:
         self.parallel = parallel
         self.owned = owned
         self._send = [(r, np.ascontiguousarray(send_index[r])) for r in sorted(send_index)]
+        self._runs = [_ascending_runs(index) for _, index in self._send]
         self._receive: list[tuple[int, slice]] = []
         start = owned
         for source in sorted(receive_count):
@@ -327,7 +337,10 @@ class Halo:
 
     @classmethod
     def build(cls, parallel: Parallel, owned: int, send_index: Mapping[int, NDArray]) -> Halo:
-        """Collective. Tell every receiver how many rows it gets. `send_index[r]` ascends."""
+        """Collective. Tell every receiver how many rows it gets.
+
+        `send_index[r]` consists of ascending runs; a row stands once in a run.
+        """
         send = {r: np.asarray(i, dtype=np.int64) for r, i in send_index.items() if len(i)}
         counts = parallel.exchange({r: np.int64(len(index)).tobytes() for r, index in send.items()})
         receive = {r: int(np.frombuffer(m, dtype=np.int64)[0]) for r, m in counts.items()}
@@ -353,6 +366,18 @@ class Halo:
         receive = {r: int(np.count_nonzero(mark)) for r, mark in marks.items() if mark.any()}
         return Halo(self.parallel, self.owned, send, receive)
 
+    def deliver(self, values: Mapping[int, NDArray]) -> NDArray:
+        """Collective. Give every ghost what its owner has for this one, as (g,) int8.
+
+        `values[r]` has an entry for each row that goes to rank r: unlike `forward`, the ghosts of
+        one body may get different values.
+        """
+        received = self.parallel.exchange(
+            {r: np.ascontiguousarray(value, dtype=np.int8).tobytes() for r, value in values.items()}
+        )
+        form = b"".join(received[source] for source, _ in self._receive)
+        return np.frombuffer(form, dtype=np.int8)
+
     def forward(self, values: NDArray) -> None:
         """Collective among neighbours. Overwrite ghost rows of (n + g, k) by their owners' rows."""
         if not self._send and not self._receive:
@@ -362,10 +387,14 @@ class Halo:
         requests = [
             communicator.Irecv(values[rows], source=source, tag=_HALO_TAG)
             for source, rows in self._receive
+            if source != self.parallel.rank
         ]
         for (destination, index), buffer in zip(self._send, outgoing, strict=True):
             # Indices are valid by construction; "clip" spares the copy that "raise" makes.
             np.take(values, index, axis=0, out=buffer, mode="clip")
+            if destination == self.parallel.rank:
+                values[self._own_ghosts] = buffer
+                continue
             requests.append(communicator.Isend(buffer, dest=destination, tag=_HALO_TAG))
             self.parallel.bytes_sent += buffer.nbytes
         MPI.Request.Waitall(requests)
@@ -373,8 +402,8 @@ class Halo:
     def reverse_add(self, values: NDArray) -> None:
         """Collective among neighbours. Add ghost rows of (n + g, k) to their owners' rows.
 
-        Contributions are added in rank order, so that the sum is the same every time. Ghost rows
-        are left as they are (stale).
+        Contributions are added in rank order, those of one rank in the order of its ghosts, so
+        that the sum is the same every time. Ghost rows are left as they are (stale).
         """
         if not self._send and not self._receive:
             return
@@ -383,13 +412,25 @@ class Halo:
         requests = [
             communicator.Irecv(buffer, source=destination, tag=_HALO_TAG)
             for (destination, _), buffer in zip(self._send, incoming, strict=True)
+            if destination != self.parallel.rank
         ]
         for source, rows in self._receive:
+            if source == self.parallel.rank:
+                continue
             requests.append(communicator.Isend(values[rows], dest=source, tag=_HALO_TAG))
             self.parallel.bytes_sent += values[rows].nbytes
         MPI.Request.Waitall(requests)
-        for (_, index), buffer in zip(self._send, incoming, strict=True):
-            values[index] += buffer
+        for (destination, index), runs, buffer in zip(
+            self._send, self._runs, incoming, strict=True
+        ):
+            back = values[self._own_ghosts] if destination == self.parallel.rank else buffer
+            for run in runs:
+                values[index[run]] += back[run]
+
+    @property
+    def _own_ghosts(self) -> slice:
+        """The ghost rows that are images of this rank's own bodies."""
+        return next(rows for source, rows in self._receive if source == self.parallel.rank)
 
     def _buffers_for(self, values: NDArray) -> tuple[list[NDArray], list[NDArray]]:
         key = (values.shape[1:], values.dtype.str)

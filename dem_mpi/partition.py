@@ -18,6 +18,7 @@ from dem_mpi import _kernels_partition as kernels
 from dem_mpi import morton
 from dem_mpi.bodies import Bodies, ImpulseMemory, pack_rows, unpack_rows
 from dem_mpi.parallel import Parallel
+from dem_mpi.periodic import PeriodicBox
 
 
 @dataclass(frozen=True)
@@ -216,19 +217,40 @@ def ghost_targets(
     nothing is sent. Every body must be on the rank that owns its key, as after `migrate`: the
     other rank takes that for granted. RuntimeError where one is not.
     """
+    targets, strays = _targets(partition, position, reach, parallel.rank)
+    if strays:
+        raise RuntimeError(f"{strays} bodies are not on the rank that owns them: migrate first")
+    return targets
+
+
+def image_targets(
+    partition: Partition, box: PeriodicBox, position: NDArray, reach: NDArray
+) -> dict[int, tuple[NDArray[np.int32], NDArray[np.int8]]]:
+    """Return (rows, image codes) of the periodic images that each rank needs, this one included.
+
+    As `ghost_targets`, for the images of the owned bodies at `position` (n, 3) [m], which must
+    lie in the box. For each rank images are in order of (code, row).
+    """
+    rows, codes = box.images(position, reach)
+    targets, _ = _targets(partition, position[rows] + box.shift(codes), reach[rows], -1)
+    return {rank: (rows[index], codes[index]) for rank, index in targets.items()}
+
+
+def _targets(
+    partition: Partition, position: NDArray, reach: NDArray, rank: int
+) -> tuple[dict[int, NDArray[np.int32]], int]:
+    """Bodies whose reach meets the region of each rank but `rank`, and how many stray from it."""
     position = np.ascontiguousarray(position, dtype=np.float64)
     reach = np.ascontiguousarray(reach, dtype=np.float64)
     pair = np.stack((partition.splitter_key, partition.splitter_gid), axis=1)
     occupied = np.ones(partition.ranks, dtype=bool)
     occupied[1:-1] = np.any(pair[1:] != pair[:-1], axis=1)
     geometry = (position, reach, partition.origin, morton.LATTICE_SIZE / partition.edge)
-    regions = (partition.splitter_key, partition.splitter_gid, occupied, parallel.rank)
+    regions = (partition.splitter_key, partition.splitter_gid, occupied, rank)
     count = np.zeros(partition.ranks, dtype=np.int64)
     strays = kernels.find_ghost_targets(*geometry, *regions, count, np.empty(0, np.int32))
-    if strays:
-        raise RuntimeError(f"{strays} bodies are not on the rank that owns them: migrate first")
     end = np.cumsum(count)
     rows = np.empty(end[-1], dtype=np.int32)
     if len(rows):
         kernels.find_ghost_targets(*geometry, *regions, end - count, rows)
-    return {int(r): rows[end[r] - count[r] : end[r]] for r in np.flatnonzero(count)}
+    return {int(r): rows[end[r] - count[r] : end[r]] for r in np.flatnonzero(count)}, strays

@@ -144,8 +144,9 @@ def measure(
     walls: Walls | None = None,
 ) -> ContactSet:
     """Collective. The contacts of the bodies as they stand, from a list that exists."""
-    rows = [neighbours.extend(x) for x in (owned.position, owned.velocity, owned.angular_velocity)]
-    return find_contacts(neighbours, *rows, walls or no_walls(), options, step)
+    position = neighbours.extend_position(owned.position)
+    motion = [neighbours.extend(x) for x in (owned.velocity, owned.angular_velocity)]
+    return find_contacts(neighbours, position, *motion, walls or no_walls(), options, step)
 
 
 def table_of(contacts: ContactSet, gid: NDArray) -> NDArray:
