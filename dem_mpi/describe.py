@@ -31,10 +31,13 @@ from dem_mpi.trajectory import (
     TOPOLOGIES,
     Field,
     FrameIndex,
+    Series,
+    check_series,
     expected_checksums,
     raise_on_mismatch,
     read_fields,
     read_index,
+    read_series,
     root_attributes,
 )
 
@@ -55,6 +58,7 @@ class Description:
     steps: tuple[int, int] = (0, 0)  # first and last
     times: tuple[float, float] = (0.0, 0.0)  # [s]
     fields: tuple[Field, ...] = ()
+    series: tuple[Series, ...] = ()
     ranks: int = 0  # that wrote a checkpoint
     version: str = ""
     scene: str = ""
@@ -87,7 +91,8 @@ class Description:
             (first, last), (start, end) = self.steps, self.times
             lines.append(f"  steps {first} to {last}, t = {start:.6g} to {end:.6g} s")
             lines.append(f"  {bodies} bodies")
-        return lines + [f"  {f.name} ({f.dtype}, {f.width}) [{f.unit}]" for f in self.fields]
+        lines += [f"  {f.name} ({f.dtype}, {f.width}) [{f.unit}]" for f in self.fields]
+        return lines + [f"  {s.name} {s.row_shape} a frame [{s.unit}]" for s in self.series]
 
 
 def describe(path: Path | str, *, verify: bool = True) -> Description:
@@ -122,11 +127,13 @@ def _describe_trajectory(
     attributes = read_attributes(file)
     fields = read_fields(path, file)
     index = read_index(path, file)
+    series = read_series(path, file)
     found = replace(
         found,
         complete=bool(attributes.get("complete", 0)),
         frames=len(index),
         fields=fields,
+        series=series,
         version=str(attributes.get("version", "")),
         scene=_scene_name(attributes),
         attributes=attributes,
@@ -141,6 +148,7 @@ def _describe_trajectory(
     try:
         if verify:
             _verify_frames(path, file, fields, index)
+            check_series(path, file, series, index)
             _verify_layout(path, file, index)
             if attributes_checksum(root_attributes(file)) != attributes.get("checksum"):
                 raise DataError(f"{path}: checksum of the attributes does not match")

@@ -4,8 +4,9 @@
 poly-vertex cell over its bodies, so that all frames share one list 0, 1, 2, … of connectivity.
 Beside it the same data stand under plain names (hard links): `f["position"]` and the other fields,
 `f["frames/offset"]` and `f["frames/count"]` saying which rows are frame k's, `frames/step` and
-`frames/time` [s]. The attribute NSteps of `VTKHDF/Steps` is the number of complete frames; what
-stands behind them belongs to a frame that was never finished.
+`frames/time` [s]. Series, what a frame has once, such as `f["walls/force"]`, have a row a frame.
+The attribute NSteps of `VTKHDF/Steps` is the number of complete frames; what stands behind them
+belongs to a frame that was never finished.
 
 Data sets grow by many frames at a time. A frame then moves nothing in the file: its rows go first,
 the number of frames last, with a flush between, so a killed run leaves whole frames.
@@ -17,6 +18,7 @@ Symbols: T frames; M rows of all frames; n local rows of one frame; k width of a
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -38,6 +40,7 @@ from dem_mpi.h5files import (
     open_checked,
     read_attribute,
     require_space,
+    row_checksums,
     write_attributes,
 )
 from dem_mpi.parallel import Parallel
@@ -51,14 +54,17 @@ from dem_mpi.trajectory import (
     Field,
     Frame,
     FrameIndex,
+    Layout,
+    Series,
+    check_series,
     expected_checksums,
     frame_bytes,
     frame_checksums,
-    index_datasets,
     raise_on_mismatch,
     read_fields,
     read_frame,
     read_index,
+    read_series,
     root_attributes,
     with_required,
     write_root_attributes,
@@ -72,6 +78,7 @@ __all__ = [
     "Field",
     "Frame",
     "FrameIndex",
+    "Series",
     "Trajectory",
     "describe",
     "frame_bytes",
@@ -100,14 +107,14 @@ class Trajectory:
         self,
         file: SharedFile,
         lock: OutputLock,
-        fields: tuple[Field, ...],
+        layout: Layout,
         index: FrameIndex,
         compression: str,
         message: str = "",
     ) -> None:
         """Not for callers: `create` and `open_for_append` make one."""
         self.path = file.path
-        self.fields = fields
+        self.layout = layout
         self.message = message
         self.frames = len(index)
         self.last_step = int(index.step[-1]) if len(index) else -1
@@ -132,6 +139,7 @@ class Trajectory:
         attributes: Mapping[str, Any],
         *,
         bodies: int,
+        series: Sequence[Series] = (),
         compression: str = "none",
         through_root: bool | None = None,
     ) -> Trajectory:
@@ -142,9 +150,10 @@ class Trajectory:
         writes there or the disk cannot hold the first frames.
         """
         lock = OutputLock(parallel, path)
+        layout = Layout(with_required(fields), tuple(series))
         with _released_on_error(lock):
             return cls._create(
-                parallel, path, fields, attributes, lock, bodies, compression, through_root
+                parallel, path, layout, attributes, lock, bodies, compression, through_root
             )
 
     @classmethod
@@ -152,7 +161,7 @@ class Trajectory:
         cls,
         parallel: Parallel,
         path: Path | str,
-        fields: Sequence[Field],
+        layout: Layout,
         attributes: Mapping[str, Any],
         lock: OutputLock,
         bodies: int,
@@ -160,11 +169,10 @@ class Trajectory:
         through_root: bool | None,
         message: str = "",
     ) -> Trajectory:
-        fields = with_required(fields)
         with agree(parallel, path, "write"):
             if parallel.rank == 0:
                 Path(path).parent.mkdir(parents=True, exist_ok=True)
-                require_space(path, _EXTENT_FRAMES * frame_bytes(fields, bodies))
+                require_space(path, _EXTENT_FRAMES * frame_bytes(layout.fields, bodies))
         file = SharedFile(
             parallel,
             path,
@@ -173,11 +181,11 @@ class Trajectory:
             through_root=through_root,
             expected_size=_STRUCTURE_BYTES,
         )
-        _lay_out(file, fields, parallel.broadcast(dict(attributes)), _chunk_rows(bodies))
+        _lay_out(file, layout, parallel.broadcast(dict(attributes)), _chunk_rows(bodies))
         file.sync()
         nothing = np.zeros(0, dtype=np.int64)
         index = FrameIndex(nothing, nothing.astype(np.float64), nothing, nothing)
-        return cls(file, lock, fields, index, compression, message)
+        return cls(file, lock, layout, index, compression, message)
 
     @classmethod
     def open_for_append(
@@ -189,6 +197,7 @@ class Trajectory:
         *,
         bodies: int,
         last_step: int,
+        series: Sequence[Series] = (),
         compression: str = "none",
         through_root: bool | None = None,
     ) -> Trajectory:
@@ -199,16 +208,17 @@ class Trajectory:
         new one begun. `message` of the result then tells the user; it is "" otherwise.
         """
         path = Path(path)
+        layout = Layout(with_required(fields), tuple(series))
         lock = OutputLock(parallel, path)
         with _released_on_error(lock):
             try:
-                index, filtered = _continuable(parallel, path, with_required(fields), last_step)
+                index, filtered = _continuable(parallel, path, layout, last_step)
             except DemError as error:
                 message = _put_aside(parallel, path, error)
                 return cls._create(
                     parallel,
                     path,
-                    fields,
+                    layout,
                     attributes,
                     lock,
                     bodies,
@@ -217,7 +227,7 @@ class Trajectory:
                     message,
                 )
             if filtered:  # compressed rows cannot be appended to safely
-                _rewrite(parallel, path, with_required(fields), index, "none", through_root)
+                _rewrite(parallel, path, layout, index, "none", through_root)
             file = SharedFile(parallel, path, "r+", libver=_LIBVER, through_root=through_root)
             with agree(parallel, path, "write"):
                 if file.file is not None:
@@ -225,10 +235,18 @@ class Trajectory:
                     _set_in_place(file.file["VTKHDF/Steps"], "NSteps", len(index))
                     _set_extent(file.file, TIMES, len(index))
             file.sync()
-            return cls(file, lock, with_required(fields), index, compression)
+            return cls(file, lock, layout, index, compression)
 
-    def write_frame(self, step: int, time: float, columns: Mapping[str, NDArray]) -> None:
+    def write_frame(
+        self,
+        step: int,
+        time: float,
+        columns: Mapping[str, NDArray],
+        series: Mapping[str, NDArray] | None = None,
+    ) -> None:
         """Collective. Append a frame: {field: this rank's (n,) or (n, k) rows}, n may be 0.
+
+        `series` has the row of each series, of which rank 0's is written.
 
         `step` must be greater than the last frame's. Columns that are no field of this trajectory
         are ignored. Raises OutputError on every rank if the frame cannot be written.
@@ -237,7 +255,11 @@ class Trajectory:
             raise ValueError(f"frame of step {step} after that of step {self.last_step}")
         rows = {
             f.name: np.ascontiguousarray(columns[f.name], dtype=f.dtype).reshape(f.shape(-1))
-            for f in self.fields
+            for f in self.layout.fields
+        }
+        once = {
+            s.name: np.ascontiguousarray((series or {})[s.name], np.float64).reshape(s.row_shape)
+            for s in self.layout.series
         }
         n = rows["gid"].shape[0]
         unequal = next((name for name, array in rows.items() if array.shape[0] != n), None)
@@ -245,24 +267,28 @@ class Trajectory:
             ValueError(f"'{unequal}' has another number of rows than 'gid'") if unequal else None
         )
         try:
-            self._write_frame(step, time, rows)
+            self._write_frame(step, time, rows, once)
         except OutputError:
             self._failed = True
             raise
 
-    def _write_frame(self, step: int, time: float, rows: Mapping[str, NDArray]) -> None:
+    def _write_frame(
+        self, step: int, time: float, rows: Mapping[str, NDArray], once: Mapping[str, NDArray]
+    ) -> None:
         n = rows["gid"].shape[0]
         start, total = self._parallel.exclusive_sum(n), self._parallel.sum(n)
         self._make_room(total)
         self._connect(start, n, total)
-        sums = np.array([checksum(rows[f.name], start) for f in self.fields], dtype=np.uint64)
-        sums = self._parallel.sum(sums)
-        for f in self.fields:
+        own = [checksum(rows[f.name], start) for f in self.layout.fields]
+        sums = self._parallel.sum(np.array(own, dtype=np.uint64))
+        for f in self.layout.fields:
             self._file.write_rows(f.place, self._rows, rows[f.name])
         with agree(self._parallel, self.path, "extend"):
             if self._file.file is not None:
                 _set_extent(self._file.file, TIMES, self.frames + 1)
-        self._file.write_on_root(self._index_rows(step, time, total, sums))
+        self._file.write_on_root(
+            self._index_rows(step, time, total, sums) | self._series_rows(once)
+        )
         self._file.flush()
         with agree(self._parallel, self.path, "write"):
             if self._file.file is not None:
@@ -301,8 +327,17 @@ class Trajectory:
         for name in TOPOLOGIES[1:]:
             for part in ("NumberOfCells", "NumberOfConnectivityIds", "Offsets"):
                 rows[f"VTKHDF/{name}/{part}"] = (k, [0])
-        for f, value in zip(self.fields, sums, strict=True):
+        for f, value in zip(self.layout.fields, sums, strict=True):
             rows[f"frames/checksum/{f.name}"] = (k, np.array([value], dtype=np.uint64))
+        return rows
+
+    def _series_rows(self, once: Mapping[str, NDArray]) -> dict[str, tuple[int, Any]]:
+        """The row of each series, and of its checksum."""
+        rows: dict[str, tuple[int, Any]] = {}
+        for name, values in once.items():
+            rows[name] = (self.frames, values[None])
+            sums = row_checksums(values.reshape(1, -1))
+            rows[f"frames/checksum/{name}"] = (self.frames, sums)
         return rows
 
     def _connect(self, start: int, n: int, total: int) -> None:
@@ -319,7 +354,7 @@ class Trajectory:
         if self.frames >= frames:
             frames = self.frames + _INDEX_CHUNK
         if self._rows + count > rows:
-            size = max(1, frame_bytes(self.fields, count))
+            size = max(1, frame_bytes(self.layout.fields, count))
             rows = self._rows + count * min(_EXTENT_FRAMES, max(1, _EXTENT_BYTES // size))
         connectivity = max(connectivity, count)
         self._capacity = (frames, rows, connectivity)
@@ -330,7 +365,7 @@ class Trajectory:
             if self._file.file is not None:
                 _set_extents(
                     self._file.file,
-                    self.fields,
+                    self.layout,
                     frames=frames,
                     rows=rows,
                     vertex_offsets=2 * frames,
@@ -341,12 +376,13 @@ class Trajectory:
 
     def _growth(self, old: tuple[int, int, int], new: tuple[int, int, int]) -> int:
         """Bytes [B] that extending takes: whole chunks, and the structures that find them."""
-        per_frame = sum(8 * width for _, width in index_datasets(self.fields).values()) + 16
+        shapes = [shape for _, shape in self.layout.index_datasets().values()]
+        per_frame = sum(8 * math.prod(shape) for shape in shapes) + 16
         chunks = [
             -(-b // self._chunk_rows) - a // self._chunk_rows for a, b in zip(old, new, strict=True)
         ]
         size = (new[0] - old[0] + _INDEX_CHUNK) * per_frame
-        size += chunks[1] * self._chunk_rows * sum(f.row_bytes for f in self.fields)
+        size += chunks[1] * self._chunk_rows * sum(f.row_bytes for f in self.layout.fields)
         size += chunks[2] * self._chunk_rows * 8
         return size + size // 64 + _STRUCTURE_BYTES
 
@@ -362,7 +398,7 @@ class Trajectory:
                 file = self._file.file
                 _set_extents(
                     file,
-                    self.fields,
+                    self.layout,
                     frames=self.frames,
                     rows=self._rows,
                     vertex_offsets=self._cells + self.frames,
@@ -381,7 +417,7 @@ class Trajectory:
             _rewrite(
                 self._parallel,
                 self.path,
-                self.fields,
+                self.layout,
                 index,
                 self._compression,
                 through_root=not self._file.by_all,
@@ -435,7 +471,7 @@ def _chunk_rows(bodies: int) -> int:
 
 def _lay_out(
     shared: SharedFile,
-    fields: Sequence[Field],
+    layout: Layout,
     attributes: Mapping[str, Any],
     chunk_rows: int,
     compression: str = "none",
@@ -443,24 +479,27 @@ def _lay_out(
     """Collective. Create every data set, empty, with links and attributes."""
     with agree(shared.parallel, shared.path, "write"):
         if shared.file is not None:
-            _create_datasets(shared, fields, chunk_rows, compression)
-            _create_links(shared.file, fields)
+            _create_datasets(shared, layout, chunk_rows, compression)
+            _create_links(shared.file, layout.fields)
             file, own = shared.file, {"format": FORMAT, "format_version": FORMAT_VERSION}
             write_root_attributes(file, {**attributes, **own})
             file.attrs["complete"] = np.int64(0)
             file["VTKHDF"].attrs["Version"] = np.array([2, 2], dtype=np.int64)
             file["VTKHDF"].attrs["Type"] = np.bytes_(b"PolyData")
             file["VTKHDF/Steps"].attrs["NSteps"] = np.int64(0)
-            write_attributes(file["frames"], {"fields": " ".join(f.name for f in fields)})
-            for f in fields:
+            names = {"fields": layout.fields, "series": layout.series}
+            write_attributes(
+                file["frames"], {k: " ".join(part.name for part in v) for k, v in names.items()}
+            )
+            for f in layout.fields:
                 write_attributes(file[f.place], {"unit": f.unit})
+            for series in layout.series:
+                write_attributes(file[series.name], {"unit": series.unit})
             write_attributes(file["frames/time"], {"unit": "s"})
 
 
-def _create_datasets(
-    shared: SharedFile, fields: Sequence[Field], chunk_rows: int, compression: str
-) -> None:
-    for f in fields:
+def _create_datasets(shared: SharedFile, layout: Layout, chunk_rows: int, compression: str) -> None:
+    for f in layout.fields:
         shared.create_dataset(
             f.place, f.shape(0), f.dtype, chunk_rows=chunk_rows, compression=compression
         )
@@ -468,9 +507,8 @@ def _create_datasets(
         shared.create_dataset(f"VTKHDF/{topology}/Connectivity", (0,), "i8", chunk_rows=chunk_rows)
     shared.create_dataset("VTKHDF/Vertices/Offsets", (0,), "i8", chunk_rows=2 * _INDEX_CHUNK)
     shared.create_dataset(TIMES, (0,), "f8", chunk_rows=_TIMES_CHUNK)
-    for name, (dtype, width) in index_datasets(fields).items():
-        shape = (0,) if width == 1 else (0, width)
-        shared.create_dataset(name, shape, dtype, chunk_rows=_INDEX_CHUNK)
+    for name, (dtype, row_shape) in layout.index_datasets().items():
+        shared.create_dataset(name, (0, *row_shape), dtype, chunk_rows=_INDEX_CHUNK)
 
 
 def _create_links(file: h5py.File, fields: Sequence[Field]) -> None:
@@ -488,15 +526,15 @@ def _create_links(file: h5py.File, fields: Sequence[Field]) -> None:
 
 def _set_extents(
     file: h5py.File,
-    fields: Sequence[Field],
+    layout: Layout,
     *,
     frames: int,
     rows: int,
     vertex_offsets: int,
     connectivity: int,
 ) -> None:
-    sizes = dict.fromkeys(index_datasets(fields), frames)
-    sizes |= {f.place: rows for f in fields}
+    sizes = dict.fromkeys(layout.index_datasets(), frames)
+    sizes |= {f.place: rows for f in layout.fields}
     sizes["VTKHDF/Vertices/Offsets"] = vertex_offsets
     sizes["VTKHDF/Vertices/Connectivity"] = connectivity
     for name, size in sizes.items():
@@ -513,16 +551,18 @@ def _set_extent(file: h5py.File, name: str, size: int) -> None:
 
 
 def _continuable(
-    parallel: Parallel, path: Path, fields: tuple[Field, ...], last_step: int
+    parallel: Parallel, path: Path, layout: Layout, last_step: int
 ) -> tuple[FrameIndex, bool]:
     """Collective. The frames to keep and whether rows are compressed; DemError if unusable."""
     with agree(parallel, path, "read", DataError), open_checked(path) as file:
-        found = read_fields(path, file)
-        if found != fields:
+        fields = layout.fields
+        found = Layout(read_fields(path, file), read_series(path, file))
+        if found != layout:
             raise DataError(
-                f"{path}: holds fields {_names(found)}, this run writes {_names(fields)}"
+                f"{path}: holds fields {_names(found)}, this run writes {_names(layout)}"
             )
         index = read_index(path, file).upto(last_step)
+        check_series(path, file, layout.series, index)
         filtered = any(file[f.place].id.get_create_plist().get_nfilters() for f in fields)
         tail = range(max(0, len(index) - _VERIFIED_ON_RESUME), len(index))
         sums = [
@@ -535,8 +575,9 @@ def _continuable(
     return index, filtered
 
 
-def _names(fields: Sequence[Field]) -> str:
-    return ", ".join(f"{f.name} ({f.dtype}, {f.width}, {f.unit})" for f in fields)
+def _names(layout: Layout) -> str:
+    names = [f"{f.name} ({f.dtype}, {f.width}, {f.unit})" for f in layout.fields]
+    return ", ".join(names + [f"{s.name} ({s.row_shape}, {s.unit})" for s in layout.series])
 
 
 def _share(parallel: Parallel, index: FrameIndex, k: int) -> tuple[int, int, int]:
@@ -569,7 +610,7 @@ def _put_aside(parallel: Parallel, path: Path, error: DemError) -> str:
 def _rewrite(
     parallel: Parallel,
     path: Path,
-    fields: tuple[Field, ...],
+    layout: Layout,
     index: FrameIndex,
     compression: str,
     through_root: bool | None,
@@ -577,7 +618,7 @@ def _rewrite(
     """Collective. Copy the frames of `index` to a file with that compression, then replace."""
     temporary = path.with_name(path.name + ".tmp")
     try:
-        _copy(parallel, path, temporary, fields, index, compression, through_root)
+        _copy(parallel, path, temporary, layout, index, compression, through_root)
         with agree(parallel, path, "rename"):
             if parallel.rank == 0:
                 temporary.replace(path)
@@ -593,7 +634,7 @@ def _copy(
     parallel: Parallel,
     path: Path,
     temporary: Path,
-    fields: tuple[Field, ...],
+    layout: Layout,
     index: FrameIndex,
     compression: str,
     through_root: bool | None,
@@ -604,7 +645,7 @@ def _copy(
         target = SharedFile(parallel, temporary, "w", libver=_LIBVER, through_root=through_root)
         try:
             chunk = source[POSITION.place].chunks[0]
-            _lay_out(target, fields, root_attributes(source), chunk, compression)
+            _lay_out(target, layout, root_attributes(source), chunk, compression)
             cells = int(np.count_nonzero(index.count))
             sizes = {
                 "frames": len(index),
@@ -614,15 +655,15 @@ def _copy(
             }
             with agree(parallel, temporary, "extend"):
                 if target.file is not None:
-                    _set_extents(target.file, fields, **sizes)
+                    _set_extents(target.file, layout, **sizes)
                     _set_extent(target.file, TIMES, len(index))
                     _set_in_place(target.file, "complete", read_attribute(source, "complete"))
                     _set_in_place(target.file["VTKHDF/Steps"], "NSteps", len(index))
-            large = {f.place: index.rows for f in fields}
+            large = {f.place: index.rows for f in layout.fields}
             large["VTKHDF/Vertices/Connectivity"] = sizes["connectivity"]
             for name, rows in large.items():
                 _copy_rows(parallel, source, target, name, rows, chunk)
-            small = dict.fromkeys([TIMES, *index_datasets(fields)], len(index))
+            small = dict.fromkeys([TIMES, *layout.index_datasets()], len(index))
             small["VTKHDF/Vertices/Offsets"] = sizes["vertex_offsets"]
             target.write_on_root({k: (0, source[k][:n]) for k, n in small.items() if n})
             target.sync()

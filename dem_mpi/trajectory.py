@@ -7,6 +7,7 @@ Symbols: T frames; M rows of all frames; F fields; n rows of one frame; k width 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,6 +66,15 @@ class Field:
         return "VTKHDF/Points" if self.name == "position" else f"VTKHDF/PointData/{self.name}"
 
 
+@dataclass(frozen=True)
+class Series:
+    """What a frame has once: a data set (T, *row_shape) of float64 under `name`, in a unit."""
+
+    name: str
+    row_shape: tuple[int, ...]
+    unit: str = "1"
+
+
 POSITION = Field("position", "f8", 3, "m")
 GID = Field("gid", "i8", 1, "1")
 
@@ -118,25 +128,35 @@ def frame_checksums(index: FrameIndex) -> NDArray:
     return row_checksums(np.stack([index.step, bits, index.count, index.offset], axis=1))
 
 
-def index_datasets(fields: Sequence[Field]) -> dict[str, tuple[str, int]]:
-    """Type and width of the data sets with one row a frame, all but the times."""
-    steps = "VTKHDF/Steps"
-    names: dict[str, tuple[str, int]] = {
-        f"{steps}/PartOffsets": ("i8", 1),
-        f"{steps}/NumberOfParts": ("i8", 1),
-        f"{steps}/PointOffsets": ("i8", 1),
-        f"{steps}/CellOffsets": ("i8", 4),
-        f"{steps}/ConnectivityIdOffsets": ("i8", 4),
-        "VTKHDF/NumberOfPoints": ("i8", 1),
-        "frames/step": ("i8", 1),
-        "frames/checksum/frame": ("u8", 1),
-    }
-    for topology in TOPOLOGIES:
-        names[f"VTKHDF/{topology}/NumberOfCells"] = ("i8", 1)
-        names[f"VTKHDF/{topology}/NumberOfConnectivityIds"] = ("i8", 1)
-    for topology in TOPOLOGIES[1:]:
-        names[f"VTKHDF/{topology}/Offsets"] = ("i8", 1)
-    return names | {f"frames/checksum/{f.name}": ("u8", 1) for f in fields}
+@dataclass(frozen=True)
+class Layout:
+    """The columns and the series of a trajectory."""
+
+    fields: tuple[Field, ...]
+    series: tuple[Series, ...] = ()
+
+    def index_datasets(self) -> dict[str, tuple[str, tuple[int, ...]]]:
+        """Type and row shape of the data sets with one row a frame, all but the times."""
+        steps = "VTKHDF/Steps"
+        names: dict[str, tuple[str, tuple[int, ...]]] = {
+            f"{steps}/PartOffsets": ("i8", ()),
+            f"{steps}/NumberOfParts": ("i8", ()),
+            f"{steps}/PointOffsets": ("i8", ()),
+            f"{steps}/CellOffsets": ("i8", (4,)),
+            f"{steps}/ConnectivityIdOffsets": ("i8", (4,)),
+            "VTKHDF/NumberOfPoints": ("i8", ()),
+            "frames/step": ("i8", ()),
+            "frames/checksum/frame": ("u8", ()),
+        }
+        for topology in TOPOLOGIES:
+            names[f"VTKHDF/{topology}/NumberOfCells"] = ("i8", ())
+            names[f"VTKHDF/{topology}/NumberOfConnectivityIds"] = ("i8", ())
+        for topology in TOPOLOGIES[1:]:
+            names[f"VTKHDF/{topology}/Offsets"] = ("i8", ())
+        names |= {s.name: ("f8", s.row_shape) for s in self.series}
+        return names | {
+            f"frames/checksum/{part.name}": ("u8", ()) for part in (*self.fields, *self.series)
+        }
 
 
 def root_attributes(file: h5py.File) -> dict[str, Any]:
@@ -226,6 +246,30 @@ def read_index(path: Path, file: h5py.File) -> FrameIndex:
     if (np.diff(index.step) <= 0).any():
         raise DataError(f"{path}: 'frames/step' does not ascend")
     return index
+
+
+def read_series(path: Path, file: h5py.File) -> tuple[Series, ...]:
+    """The series of a trajectory, none in one without. DataError (65) if it is damaged."""
+    try:
+        names = str(read_attributes(file["frames"]).get("series", "")).split()
+        return tuple(
+            Series(name, file[name].shape[1:], read_attribute(file[name], "unit")) for name in names
+        )
+    except HDF5_ERRORS as error:
+        raise DataError(f"{path}: damaged: {reason(error)}") from None
+
+
+def check_series(path: Path, file: h5py.File, series: Sequence[Series], index: FrameIndex) -> None:
+    """Compare the checksum of every frame's row. Raises DataError (65) where one differs."""
+    n = len(index)
+    for one in series:
+        values = file[one.name][:n].reshape(n, math.prod(one.row_shape))
+        wrong = np.flatnonzero(row_checksums(values) != file[f"frames/checksum/{one.name}"][:n])
+        if len(wrong):
+            raise DataError(
+                f"{path}: checksum of '{one.name}' does not match in frame {wrong[0]} "
+                f"(step {index.step[wrong[0]]})"
+            )
 
 
 def expected_checksums(file: h5py.File, fields: Sequence[Field], frames: range) -> NDArray:

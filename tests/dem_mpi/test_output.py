@@ -20,7 +20,7 @@ from mpi4py import MPI
 from dem_mpi import checkpoint
 from dem_mpi.errors import DataError, OutputError
 from dem_mpi.h5files import OutputLock, lock_holder, require_space
-from dem_mpi.output import Field, Trajectory, describe, read_frame
+from dem_mpi.output import Field, Series, Trajectory, describe, read_frame
 from dem_mpi.parallel import Parallel
 
 from launch import kill_ranks, run_ranks, start_ranks
@@ -94,6 +94,59 @@ def assert_frames(path, steps):
         assert actual.columns.keys() == expected.keys()
         for name, array in expected.items():
             assert np.array_equal(actual.columns[name], array), f"{name} of step {step}"
+
+
+WALLS = (Series("walls/force", (2, 3), "N"), Series("walls/torque", (2, 3), "N m"))
+
+
+def wall_reactions(step):
+    """The rows of both series, a function of the step."""
+    force = np.random.default_rng(1000 + step).normal(size=(2, 3))
+    return {"walls/force": force, "walls/torque": -force}
+
+
+@on_ranks
+@pytest.mark.parametrize("compression", ["none", "gzip"])
+def test_a_series_has_one_checked_row_a_frame_and_goes_on_after_an_interruption(
+    parallel, shared_path, compression
+):
+    path = shared_path / "run.h5"
+    options = {"series": WALLS, "compression": compression}
+    trajectory = create(parallel, path, **options)
+    for step in (0, 1, 2, 3):
+        rows = rows_of(parallel, frame(step))
+        trajectory.write_frame(step, 0.1 * step, rows, wall_reactions(step))
+    trajectory.close()
+    trajectory = go_on(parallel, path, last_step=2, **options)
+    trajectory.write_frame(5, 0.5, rows_of(parallel, frame(5)), wall_reactions(5))
+    trajectory.seal()
+    parallel.barrier()
+    assert_frames(path, [0, 1, 2, 5])
+    with h5py.File(path, "r") as file:
+        for name in ("walls/force", "walls/torque"):
+            expected = [wall_reactions(step)[name] for step in (0, 1, 2, 5)]
+            assert np.array_equal(file[name], expected)
+        assert file["walls/torque"].attrs["unit"] == b"N m"
+
+
+def test_a_changed_number_of_a_series_is_found_and_named(parallel, tmp_path):
+    path = tmp_path / "run.h5"
+    trajectory = create(parallel, path, series=WALLS)
+    trajectory.write_frame(4, 0.4, frame(4), wall_reactions(4))
+    trajectory.seal()
+    with h5py.File(path, "r+") as file:
+        file["walls/torque"][0, 1, 2] += 1e-9
+    description = describe(path)
+    assert not description.valid
+    assert "'walls/torque' does not match in frame 0 (step 4)" in description.reason
+
+
+def test_a_trajectory_with_other_series_is_kept_and_a_new_one_begun(parallel, tmp_path):
+    path = tmp_path / "run.h5"
+    create(parallel, path, series=WALLS).close()
+    with go_on(parallel, path, last_step=0, series=WALLS[:1]) as trajectory:
+        assert "walls/torque" in trajectory.message
+    assert (tmp_path / "run.h5.damaged-1").exists()
 
 
 def contents(path):
