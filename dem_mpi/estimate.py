@@ -28,6 +28,7 @@ from dem_mpi.scenario import Scenario, body_count, friction_table, frictional
 from dem_mpi.scene_walls import BoxWall
 from dem_mpi.shapes import sphere_volume
 from dem_mpi.sizes import largest_radius, smallest_radius
+from dem_mpi.wall_checks import holds
 from dem_mpi.walls import wall_faces
 
 _PACKING_FRACTION = 0.6  # of a settled bed
@@ -118,8 +119,7 @@ def estimate(scenario: Scenario, ranks: int = 1) -> Estimate:
 
 def _settles(scenario: Scenario) -> bool:
     """Whether something holds the bodies against gravity: a wall that faces it."""
-    gravity = np.array(scenario.gravity)
-    return bool(np.any(wall_faces(scenario).normal @ gravity < 0.0))
+    return holds(wall_faces(scenario), scenario.gravity)
 
 
 def contacts_per_body(scenario: Scenario) -> float:

@@ -14,8 +14,10 @@ from dem_mpi.placement import grid, grid_capacity
 from dem_mpi.scene_bodies import BodyGroup
 from dem_mpi.scene_errors import nearest
 from dem_mpi.scene_models import Scenario
+from dem_mpi.scene_periodic import periodic_doubts, periodic_violations
 from dem_mpi.scene_walls import wall_name
 from dem_mpi.sizes import largest_reach, thinnest_half
+from dem_mpi.wall_checks import Behind, behind, top_speed
 from dem_mpi.walls import PLANE, wall_faces
 from dem_mpi.yaml_reader import KeyPath
 
@@ -41,14 +43,15 @@ def violations(scenario: Scenario) -> Iterator[Finding]:
     """The broken rules, in an order in which later ones may rely on earlier ones."""
     yield from _steps(scenario)
     yield from _names(scenario)
+    yield from itertools.starmap(Finding, periodic_violations(scenario))
     for index, group in enumerate(scenario.bodies):
         if group.placement.file is None:
             yield from _grid_room(index, group)
         else:
             yield from _file_form(index, group)
-    for index, depth, face, certain in _behind_walls(scenario, _extents(scenario)):
-        if certain:
-            rule = f"its bodies would reach {depth:.3g} m behind wall '{face}'"
+    for index, found in _behind_walls(scenario, _extents(scenario)):
+        if found.certain:
+            rule = f"its bodies would reach {found.depth:.3g} m behind wall '{found.face}'"
             yield Finding(("bodies", index, "placement", "jittered_grid"), rule)
 
 
@@ -57,6 +60,7 @@ def doubts(scenario: Scenario) -> Iterator[Finding]:
     extents = _extents(scenario)
     yield from _speed_doubts(scenario, extents)
     yield from _place_doubts(scenario, extents)
+    yield from itertools.starmap(Finding, periodic_doubts(scenario))
     frictions = [(("friction", "default"), scenario.friction.default)]
     for index, pair in enumerate(scenario.friction.pairs):
         frictions.append((("friction", "pairs", index, "mu"), pair.mu))
@@ -169,34 +173,27 @@ def _corners(extent: Extent) -> np.ndarray:
     return np.array(list(itertools.product(*zip(*extent, strict=True))))
 
 
-def _behind_walls(
-    scenario: Scenario, extents: dict[int, Extent]
-) -> Iterator[tuple[int, float, str, bool]]:
-    """(group, depth [m], wall face, certain) where a group's region reaches behind a wall.
-
-    For an oblique wall a corner of the region may lie behind it with no body there.
-    """
+def _behind_walls(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[tuple[int, Behind]]:
+    """The groups whose region reaches behind a wall."""
     faces = wall_faces(scenario)
     for index, extent in extents.items():
-        tolerance = 1e-9 * _length(extent)
-        for k, name in enumerate(faces.name):
-            if faces.kind[k] != PLANE:
-                continue
-            height = (_corners(extent) - faces.point[k]) @ faces.normal[k]
-            if height.min() < -tolerance:
-                straight = np.count_nonzero(faces.normal[k]) == 1
-                yield index, -float(height.min()), name, straight or height.max() < 0
+        for found in behind(faces, extent.low, extent.high):
+            yield index, found
 
 
 def _place_doubts(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Finding]:
-    for index, depth, face, certain in _behind_walls(scenario, extents):
-        if not certain:
-            rule = f"a corner of it lies {depth:.3g} m behind the oblique wall '{face}'"
-            yield Finding(("bodies", index, "placement", "jittered_grid"), rule)
+    for index, found in _behind_walls(scenario, extents):
+        if not found.certain:
+            yield Finding(("bodies", index, "placement", "jittered_grid"), found.rule)
     domain = Extent(np.array(scenario.domain.min), np.array(scenario.domain.max))
     for index, extent in extents.items():
         if (extent.low > domain.high).any() or (extent.high < domain.low).any():
             yield Finding(("bodies", index, "placement"), "these bodies start outside the domain")
+        for axis in scenario.domain.periodic:
+            k = "xyz".index(axis)
+            if extent.high[k] - extent.low[k] > (domain.high - domain.low)[k] * (1 + 1e-9):
+                rule = f"is longer than the period along {axis}; bodies may overlap across the face"
+                yield Finding(("bodies", index, "placement"), rule)
     yield from _shared_space(extents)
 
 
@@ -234,13 +231,12 @@ def _speed_doubts(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Fi
                 f"within a step; {radius / speed:.2g} s would resolve it"
             )
             yield Finding(("time", "step"), rule)
+    faces = wall_faces(scenario)
+    domain = Extent(np.array(scenario.domain.min), np.array(scenario.domain.max))
     for index, wall in enumerate(scenario.walls):
         if wall.motion is None or not radii:
             continue
-        speed = math.hypot(*wall.motion.velocity)
-        if wall.motion.oscillation is not None:
-            swing = wall.motion.oscillation
-            speed += 2 * math.pi * swing.frequency * math.hypot(*swing.amplitude)
+        speed = top_speed(wall.motion, faces, domain.low, domain.high)
         if speed * step > min(radii):
             rule = f"moves up to {speed:.3g} m/s, more than a radius of {min(radii):g} m in a step"
             yield Finding(("walls", index, "motion"), rule)
