@@ -16,13 +16,15 @@ from dem_mpi.bodies import FIELDS, Bodies
 from dem_mpi.errors import DemError, InputError, StoppedError
 from dem_mpi.h5files import OutputLock, require_space
 from dem_mpi.metrics import PHASES, MetricsLog, Progress, closing_table, resident_memory
-from dem_mpi.output import Field, Trajectory, describe, frame_bytes
+from dem_mpi.output import Field, Series, Trajectory, describe, frame_bytes
 from dem_mpi.parallel import Parallel
 from dem_mpi.placement import place
 from dem_mpi.scenario import LoadedScenario, Scenario, body_count, difference, frictional
+from dem_mpi.scene_bodies import removal_name
 from dem_mpi.signals import StopRequest
 from dem_mpi.simulation import Simulation, SolverFailureError, StepRecord, redistribute, start
 from dem_mpi.state import State, restore, save
+from dem_mpi.walls import wall_faces
 
 _PATIENCE = 5.0  # seconds that ranks wait for each other when one reports an error
 
@@ -203,8 +205,13 @@ class Run:
             "version": __version__,
             "seed": scenario.seed,
             "units": "SI: m, kg, s, N s, J",
+            "walls": " ".join(wall_faces(scenario).name),
         }
-        common = {"bodies": self._bodies, "compression": scenario.output.compression}
+        common = {
+            "bodies": self._bodies,
+            "series": wall_series(scenario),
+            "compression": scenario.output.compression,
+        }
         if not resumed:
             self._discard_checkpoints()
             return Trajectory.create(self._parallel, self._path, self._fields, attributes, **common)
@@ -272,6 +279,7 @@ class Run:
         resting = (
             record.largest_speed < rest.max_speed and record.kinetic_speed < rest.kinetic_speed
         )
+        resting = resting and not self._simulation.expected
         state.steps_at_rest = state.steps_at_rest + 1 if resting else 0
 
     # ---- records ---------------------------------------------------------------------------
@@ -304,7 +312,10 @@ class Run:
         time = state.step * self._scenario.time.step
         position = self._simulation.wrapped_position()
         columns = {**state.bodies.arrays(), "position": position}
-        self._trajectory.write_frame(state.step, time, columns)
+        impulse, elapsed = self._simulation.take_wall_impulse()
+        mean = impulse / elapsed if elapsed > 0.0 else impulse
+        reactions = {"walls/force": mean[:, :3], "walls/torque": mean[:, 3:]}
+        self._trajectory.write_frame(state.step, time, columns, reactions)
 
     def _save(self) -> Path:
         """Collective. Checkpoint; the frames before it reach the disk first."""
@@ -329,9 +340,25 @@ class Run:
         facts = [f"{self._trajectory.frames} frames in {self._path}"]
         if state.flagged:
             facts.append(f"{state.flagged} steps missed their tolerance and are flagged")
-        if state.removed:
-            facts.append(f"{state.removed} bodies left the domain and were removed")
+        facts += self._comings_and_goings()
         closing_table(self._parallel, self._simulation.timer, perf_counter() - self._started, facts)
+
+    def _comings_and_goings(self) -> list[str]:
+        """What to report of bodies that came in, are still to come, and were taken out."""
+        state, regions = self._simulation.state, self._scenario.removal
+        facts = []
+        if state.inserted.any() or self._simulation.expected:
+            missing = self._simulation.expected
+            still = f", {missing} have not come in yet" if missing else ""
+            facts.append(f"{int(state.inserted.sum())} bodies were inserted{still}")
+        for k, (count, mass) in enumerate(zip(state.taken, state.taken_mass, strict=True)):
+            if k < len(regions):
+                name = removal_name(regions[k], k)
+                facts.append(f"{count} bodies, {mass:.6g} kg, were removed in '{name}'")
+        left = state.removed - int(state.taken.sum())
+        if left:
+            facts.append(f"{left} bodies left the domain and were removed")
+        return facts
 
 
 def trajectory_fields(scenario: Scenario) -> tuple[Field, ...]:
@@ -342,6 +369,14 @@ def trajectory_fields(scenario: Scenario) -> tuple[Field, ...]:
         width = field.row_shape[0] if field.row_shape else 1
         columns.append(Field(name, _code(field.dtype), width, field.unit))
     return tuple(columns)
+
+
+def wall_series(scenario: Scenario) -> tuple[Series, ...]:
+    """Return the reactions of the walls that stand in the trajectory, none without walls."""
+    faces = len(wall_faces(scenario).name)
+    if not faces:
+        return ()
+    return (Series("walls/force", (faces, 3), "N"), Series("walls/torque", (faces, 3), "N m"))
 
 
 def checkpoint_bytes(bodies: int) -> int:

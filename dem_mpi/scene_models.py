@@ -26,7 +26,15 @@ from dem_mpi.scene_bodies import BodyGroup, Removal
 from dem_mpi.scene_walls import Wall
 
 BodyField = Literal[
-    "position", "velocity", "angular_velocity", "orientation", "radius", "gid", "material"
+    "position",
+    "velocity",
+    "angular_velocity",
+    "orientation",
+    "radius",
+    "half_length",
+    "shape",
+    "gid",
+    "material",
 ]
 
 
