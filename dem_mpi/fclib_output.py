@@ -7,6 +7,7 @@ did not converge is no solution: it goes in as one more guess, from which a solv
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,15 +16,18 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from dem_mpi.errors import DemError, InputError
+from dem_mpi.errors import DataError, DemError, InputError
 from dem_mpi.fclib import FclibProblem
 from dem_mpi.h5files import (
+    HDF5_ERRORS,
     OutputLock,
     SharedFile,
     agree,
     fsync,
     open_checked,
+    reason,
     require_space,
+    row_blocks,
     write_attributes,
 )
 from dem_mpi.parallel import Parallel
@@ -117,13 +121,40 @@ def _write(
 
 
 def _copy_problem(problem: FclibProblem, target: h5py.File, group: str) -> None:
-    """Copy all but the group to be written; attributes, which FCLIB does not read, are left out."""
+    """Copy all but the group to be written; attributes, which FCLIB does not read, are left out.
+
+    Data sets are read and written: HDF5's own copy of objects crashes on some damaged files.
+    """
     with open_checked(problem.path) as source:
-        for name in source:
-            if name != group:
-                source.copy(source[name], target, name, without_attrs=True)
+        names: list[str] = []
+        source.visit(names.append)
+        for name in names:
+            if f"{name}/".startswith(f"{group}/"):
+                continue
+            if isinstance(source[name], h5py.Dataset):
+                _copy_dataset(source[name], target, name)
+            else:
+                target.require_group(name)
     if group.startswith("guesses/"):
         if _COUNT in target:
             del target[_COUNT]
-        target.require_group("guesses")
         target[_COUNT] = np.array([problem.guesses + 1], dtype=np.int32)
+
+
+def _copy_dataset(source: h5py.Dataset, target: h5py.File, name: str) -> None:
+    copy = target.create_dataset(name, source.shape, source.dtype)
+    if source.ndim == 0:
+        copy[()] = _read(source, ())
+        return
+    row_bytes = source.dtype.itemsize * math.prod(source.shape[1:])
+    for first, last in row_blocks(0, source.shape[0], row_bytes):
+        copy[first:last] = _read(source, slice(first, last))
+
+
+def _read(source: h5py.Dataset, place: Any) -> Any:
+    try:
+        return source[place]
+    except HDF5_ERRORS as error:
+        raise DataError(
+            f"{source.file.filename}: '{source.name}' cannot be read: {reason(error)}"
+        ) from None

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +40,10 @@ from dem_mpi.signals import StopRequest
 from dem_mpi.solvers.apgd import Apgd, ApgdOptions
 from dem_mpi.solvers.result import SolveReport
 
+if TYPE_CHECKING:
+    from dem_mpi.sparse_delassus import FactoredDelassus, MatrixDelassus
+
 ToleranceKind = Literal["scaled", "absolute", "thesis"]
-ASYMMETRY_TO_MENTION = 1e-10
 NOT_CONVERGED = DemError.exit_code
 
 
@@ -118,7 +120,7 @@ def solve_file(
         ).solve(cone, _guess(problem, options.guess))
         for line in _report_lines(report, cone, prepared):
             say(line)
-        if operator.asymmetry > ASYMMETRY_TO_MENTION:
+        if not operator.symmetric:
             say(_asymmetry_line(problem.form, operator.asymmetry))
         for line in _stored_lines(problem, cone, report):
             say(line)
@@ -159,7 +161,7 @@ def end_on_signals(stop: StopRequest) -> None:
         signal.raise_signal(signal.Signals[stop.name])
 
 
-def _operator(problem: FclibProblem, parallel: Parallel):
+def _operator(problem: FclibProblem, parallel: Parallel) -> MatrixDelassus | FactoredDelassus:
     # Loaded here: PETSc starts on all ranks together.
     from dem_mpi.sparse_delassus import FactoredDelassus, MatrixDelassus
 
@@ -173,7 +175,14 @@ def _guess(problem: FclibProblem, name: str | None) -> NDArray:
     return zero if name is None else problem.stored.get(name, zero)
 
 
-def _write(parallel, out: Path, problem: FclibProblem, operator, report: SolveReport) -> str:
+def _write(
+    parallel: Parallel,
+    out: Path,
+    problem: FclibProblem,
+    operator: MatrixDelassus | FactoredDelassus,
+    report: SolveReport,
+) -> str:
+    """Collective. Write the result; returns a line that says so."""
     vectors = {"r": report.impulse, "u": report.velocity}
     if problem.form == "global":
         vectors["v"] = operator.body_velocity(report.impulse)

@@ -52,6 +52,11 @@ class MatrixDelassus:
         self._W.mult(self._r, self._u)
         out[:] = self._u.getArray(readonly=True).reshape(out.shape)
 
+    @property
+    def symmetric(self) -> bool:
+        """Whether W is symmetric up to round-off."""
+        return self.asymmetry <= ROUND_OFF
+
     def diagonal(self) -> NDArray:
         """Return the diagonal of W, (m, 3) [1/kg]."""
         return self._diagonal
@@ -73,19 +78,23 @@ class FactoredDelassus:
         self.asymmetry = checked_asymmetry(M, bodies, label, parallel)
         H_t = problem.jacobian
         block = _block_size(M, bodies, parallel)
-        self._H_t = _matrix(H_t, bodies.count, parallel)
-        self._p, self._u = self._H_t.createVecs()
-        self._v = self._p.duplicate()
-        self._r = self._u.duplicate()
         self._mass: _MassInverse = (
             _BlockInverse(M, block, bodies, label, parallel)
             if block
             else _DirectInverse(M, self.asymmetry, bodies, label, parallel)
         )
+        self._H_t = _matrix(H_t, bodies.count, parallel)
+        self._p, self._u = self._H_t.createVecs()
+        self._v = self._p.duplicate()
+        self._r = self._u.duplicate()
         self.entries = parallel.sum(int(H_t.nnz))
         self.description = f"H with {self.entries} entries, {self._mass.description}"
         self._diagonal = self._mass.diagonal(self._H_t, H_t).reshape(-1, COLUMNS)
-        _check_contacts(self._diagonal, problem, parallel)
+        try:
+            _check_contacts(self._diagonal, problem, parallel)
+        except DataError:
+            self.destroy()
+            raise
         self._force = problem.force
         self.offset = problem.offset + self._free_velocity(problem.offset.shape)
 
@@ -110,6 +119,11 @@ class FactoredDelassus:
         self._p.getArray()[:] += self._force
         self._mass.solve(self._p, self._v)
         return self._v.getArray().copy()
+
+    @property
+    def symmetric(self) -> bool:
+        """Whether M is symmetric up to round-off."""
+        return self.asymmetry <= ROUND_OFF
 
     def diagonal(self) -> NDArray:
         """Return the diagonal of N, (m, 3) [1/kg]."""
@@ -213,10 +227,12 @@ class _DirectInverse:
             self._factor.setMumpsIcntl(24, 1)
             self._ksp.setUp()
         except PETSc.Error as error:
+            self.destroy()
             raise DemError(f"{label}: cannot be factorised by PETSc with MUMPS: {error}") from None
         if symmetric:
             negative, zero, _ = self._factor.getInertia()
             if negative or zero:
+                self.destroy()
                 raise DataError(
                     f"{label} is not positive definite: {negative} negative and {zero} zero "
                     "eigenvalues"
