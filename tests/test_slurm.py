@@ -323,8 +323,8 @@ def test_shellcheck_finds_nothing():
 # ---- in a SLURM of one node ------------------------------------------------------------------
 
 RANKS = 2
-LENGTH = ("--set", "time.end=2", "--set", "output.interval=0.1", "--set", "checkpoint.interval=0.5")
-STEPS = 1000
+LENGTH = ("--set", "time.end=1", "--set", "output.interval=0.1", "--set", "checkpoint.interval=0.3")
+STEPS = 500
 ENDED = {"COMPLETED", "FAILED", "CANCELLED", "TIMEOUT", "NODE_FAIL", "OUT_OF_MEMORY"}
 
 
@@ -351,6 +351,15 @@ class Slurm:
         """What `scontrol show job` tells."""
         shown = self.call("scontrol", "--oneliner", "show", "job", job)
         return dict(re.findall(r"(\w+)=(\S*)", shown))
+
+    def minutes(self, job: str) -> int:
+        """Whole minutes that a job has run since its last start."""
+        hours, minutes, _ = self.job(job)["RunTime"].split(":")
+        return 60 * int(hours) + int(minutes)
+
+    def limit_time(self, job: str, minutes: int) -> None:
+        """Allow a job so many minutes from its last start on."""
+        self.call("scontrol", "update", f"JobId={job}", f"TimeLimit={minutes}")
 
     def end_state(self, job: str, timeout: float = 180) -> tuple[str, str, int]:
         """State, exit code and number of restarts of a job that has ended, once it has."""
@@ -426,13 +435,15 @@ def test_a_run_across_two_time_limits_equals_the_uninterrupted_one(
     directory, log = tmp_path / "limited", tmp_path / "log"
     job = slurm.call(
         "sbatch", "--parsable", "--ntasks", str(RANKS), "--output", log,
-        "--time=1", "--signal=B:USR1@20",
+        "--time=60", "--signal=B:USR1@60",
         SCRIPTS / "run.sbatch", scene, "--out", directory, "--launcher", launcher, *LENGTH,
     ).strip()  # fmt: skip
-    for limit, step in ((1, 200), (2, 500)):
-        # SLURM looks every 30 s whose time is up; here as many steps as wanted are done by then.
+    for limit, step in ((1, 50), (2, 150)):
+        # The run stands still in the middle while SLURM, which looks every 30 s, finds its time up.
         with frozen(directory, step):
-            wait_for(lambda n=limit: log.read_text().count("warned") == n, 90, "the warning")
+            slurm.limit_time(job, slurm.minutes(job) + 2)
+            wait_for(lambda n=limit: log.read_text().count("warned") == n, 120, "the warning")
+        slurm.limit_time(job, 60)
     assert slurm.end_state(job) == ("COMPLETED", "0:0", 2), log.read_text()
     assert log.read_text().count("resuming from run.checkpoint.") == 2
 
