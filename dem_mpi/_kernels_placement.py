@@ -55,3 +55,75 @@ def uniform_numbers(key, index, second, third, stream, blocks, out):
             words = philox(c0, c1, c2, c3, k0, k1)
             for w in range(4):
                 out[i, 4 * b + w] = np.float64(words[w] >> _SHIFT) * _UNIT
+
+
+@jit
+def link(cell, first, head, following):
+    """Put the spheres first, first + 1, ... into the lists of their cells (n,)."""
+    for i in range(len(cell)):
+        following[first + i] = head[cell[i]]
+        head[cell[i]] = first + i
+
+
+@jit
+def is_free(x, y, z, reach, gap, cell, stride_x, stride_y, head, following, spheres):
+    """Whether no sphere in the cell or around it is closer than `gap` to the sphere at x, y, z."""
+    for dx in range(-1, 2):
+        for dy in range(-1, 2):
+            for dz in range(-1, 2):
+                s = head[cell + dx * stride_x + dy * stride_y + dz]
+                while s >= 0:
+                    apart = reach + spheres[s, 3] + gap
+                    a, b, c = x - spheres[s, 0], y - spheres[s, 1], z - spheres[s, 2]
+                    if a * a + b * b + c * c < apart * apart:
+                        return False
+                    s = following[s]
+    return True
+
+
+@jit
+def find_blocked(candidate, reach, cell, strides, head, following, spheres, blocked):
+    """Mark in blocked (b, k) uint8 the candidates (b, k, 3) that overlap a sphere.
+
+    reach (b,) is that of the b bodies, cell (b, k) where their k candidates lie.
+    """
+    for b in range(candidate.shape[0]):
+        for k in range(candidate.shape[1]):
+            x, y, z = candidate[b, k]
+            blocked[b, k] = not is_free(
+                x, y, z, reach[b], 0.0, cell[b, k], strides[0], strides[1], head, following,
+                spheres,
+            )  # fmt: skip
+
+
+@jit
+def accept_in_order(
+    candidate, reach, queue, blocked, cell, strides, head, following, spheres, chosen
+):
+    """Choose for each body its first candidate that is not blocked and clear of those chosen.
+
+    Within a queue (b,) a body that finds no place holds up those behind it. chosen (b,) becomes
+    the number of the candidate, or -1. The lists of cells are empty before.
+    """
+    held = np.zeros(queue.max() + 1 if len(queue) else 0, np.bool_)
+    count = 0
+    for b in range(candidate.shape[0]):
+        chosen[b] = -1
+        if held[queue[b]]:
+            continue
+        for k in range(candidate.shape[1]):
+            if blocked[b, k]:
+                continue
+            x, y, z = candidate[b, k]
+            if is_free(
+                x, y, z, reach[b], 0.0, cell[b, k], strides[0], strides[1], head, following,
+                spheres,
+            ):  # fmt: skip
+                spheres[count, 0], spheres[count, 1], spheres[count, 2] = x, y, z
+                spheres[count, 3] = reach[b]
+                following[count] = head[cell[b, k]]
+                head[cell[b, k]] = count
+                count += 1
+                chosen[b] = k
+                break
+        held[queue[b]] = chosen[b] < 0

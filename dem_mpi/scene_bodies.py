@@ -300,3 +300,8 @@ class Removal(Region):
     """A region in which bodies are taken out of the run as soon as their centre is there."""
 
     name: Name | None = note("Name in reports; by default removal<number>", default=None)
+
+
+def removal_name(region: Removal, index: int) -> str:
+    """The region's name in reports."""
+    return region.name or f"removal{index}"

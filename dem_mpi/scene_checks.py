@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dem_mpi.body_file import BodyFile
-from dem_mpi.placement import grid, grid_capacity
+from dem_mpi.placement import grid
+from dem_mpi.placement_checks import room_violations, start_region
 from dem_mpi.scene_bodies import BodyGroup
 from dem_mpi.scene_errors import nearest
 from dem_mpi.scene_models import Scenario
@@ -45,14 +46,13 @@ def violations(scenario: Scenario) -> Iterator[Finding]:
     yield from _names(scenario)
     yield from itertools.starmap(Finding, periodic_violations(scenario))
     for index, group in enumerate(scenario.bodies):
-        if group.placement.file is None:
-            yield from _grid_room(index, group)
-        else:
+        if group.placement.file is not None:
             yield from _file_form(index, group)
+    yield from itertools.starmap(Finding, room_violations(scenario))
     for index, found in _behind_walls(scenario, _extents(scenario)):
         if found.certain:
             rule = f"its bodies would reach {found.depth:.3g} m behind wall '{found.face}'"
-            yield Finding(("bodies", index, "placement", "jittered_grid"), rule)
+            yield Finding(_placement_path(scenario, index), rule)
 
 
 def doubts(scenario: Scenario) -> Iterator[Finding]:
@@ -115,33 +115,6 @@ def _names(scenario: Scenario) -> Iterator[Finding]:
             yield Finding(("walls", i, "name"), f"walls[{first}] has this name already")
 
 
-def _grid_room(index: int, group: BodyGroup) -> Iterator[Finding]:
-    """Whether the bodies of a group fit in its grid."""
-    region = group.placement.jittered_grid
-    assert region is not None
-    assert group.count is not None
-    here: KeyPath = ("bodies", index, "placement", "jittered_grid")
-    diameter = 2 * largest_reach(group)
-    size = " x ".join(f"{b - a:.6g}" for a, b in zip(region.min, region.max, strict=True))
-    if region.spacing is not None and region.spacing < diameter * (1 - 1e-12):
-        yield Finding((*here, "spacing"), f"must be at least the largest diameter, {diameter:g} m")
-        return
-    fit = grid_capacity(region, diameter)
-    if fit == 0:
-        yield Finding(here, f"{size} m is too thin for bodies of diameter {diameter:g} m")
-        return
-    spacing = ""
-    if region.spacing is not None:
-        spacing = f" with spacing {region.spacing:g} m"
-        fit = grid(region, group.count, diameter / 2).capacity
-    if fit < group.count:
-        yield Finding(
-            ("bodies", index, "count"),
-            f"bodies of diameter {diameter:g} m{spacing} do not all fit in the grid of {size} m; "
-            f"{fit} do. Lower count or enlarge placement.jittered_grid",
-        )
-
-
 def _file_form(index: int, group: BodyGroup) -> Iterator[Finding]:
     """Whether a file of bodies is there and states what the scene does not."""
     path = group.placement.path
@@ -165,7 +138,16 @@ def _extents(scenario: Scenario) -> dict[int, Extent]:
         if region is not None and group.count is not None:
             radius = largest_reach(group)
             extents[index] = Extent(*grid(region, group.count, radius).bounds(group.count, radius))
+        filled = start_region(group)
+        if filled is not None:
+            extents[index] = Extent(np.array(filled[1].min), np.array(filled[1].max))
     return extents
+
+
+def _placement_path(scenario: Scenario, index: int) -> KeyPath:
+    """The region that the bodies of a group start in."""
+    filled = start_region(scenario.bodies[index])
+    return ("bodies", index, "placement", filled[0] if filled else "jittered_grid")
 
 
 def _corners(extent: Extent) -> np.ndarray:
@@ -184,7 +166,7 @@ def _behind_walls(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[tu
 def _place_doubts(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Finding]:
     for index, found in _behind_walls(scenario, extents):
         if not found.certain:
-            yield Finding(("bodies", index, "placement", "jittered_grid"), found.rule)
+            yield Finding(_placement_path(scenario, index), found.rule)
     domain = Extent(np.array(scenario.domain.min), np.array(scenario.domain.max))
     for index, extent in extents.items():
         if (extent.low > domain.high).any() or (extent.high < domain.low).any():
@@ -194,15 +176,15 @@ def _place_doubts(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Fi
             if extent.high[k] - extent.low[k] > (domain.high - domain.low)[k] * (1 + 1e-9):
                 rule = f"is longer than the period along {axis}; bodies may overlap across the face"
                 yield Finding(("bodies", index, "placement"), rule)
-    yield from _shared_space(extents)
+    yield from _shared_space(scenario, extents)
 
 
-def _shared_space(extents: dict[int, Extent]) -> Iterator[Finding]:
-    """Grids that reach into one another."""
-    groups = list(extents)
+def _shared_space(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Finding]:
+    """Grids that reach into one another. (Random places and inlets avoid other bodies.)"""
+    groups = [g for g in extents if start_region(scenario.bodies[g]) is None]
     if len(groups) < 2:
         return
-    low, high = (np.array([extent[side] for extent in extents.values()]) for side in range(2))
+    low, high = (np.array([extents[g][side] for g in groups]) for side in range(2))
     for i in range(len(groups) - 1):
         overlap = np.minimum(high[i], high[i + 1 :]) - np.maximum(low[i], low[i + 1 :])
         for j in np.flatnonzero((overlap > 1e-9 * (high[i] - low[i])).all(axis=1)):

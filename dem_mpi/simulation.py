@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dem_mpi import _kernels_solver as kernels
-from dem_mpi import integrator
+from dem_mpi import insertion, integrator
 from dem_mpi.bodies import Bodies, ImpulseMemory
 from dem_mpi.cone import ConeProblem, Tolerance, median_of_positive
 from dem_mpi.contacts import (
@@ -91,6 +91,9 @@ class StepRecord:
     overlap: float
     coincident: int
     outside: int
+    waiting: int
+    removed: int
+    removed_mass: float
     substeps: int
     rebuilt: bool
     moved: int
@@ -180,12 +183,13 @@ class Simulation:
         self._rebuilt, self._moved = False, 0
         sent = self.parallel.bytes_sent
         time = state.step * h
+        waiting = self._let_in(time)
         done = self._advance(time, h)
         state.step += 1
         state.wall_impulse = state.wall_impulse + sum(s.wall_impulse for s in done)
         state.wall_time += h
-        outside = self._leave_domain()
-        record = self._record(done, outside, self.parallel.bytes_sent - sent)
+        outside = self._take_out()
+        record = self._record(done, outside, waiting, self.parallel.bytes_sent - sent)
         if not record.converged:
             state.flagged += 1
         return record
@@ -296,12 +300,13 @@ class Simulation:
     # ---- partition and pair list -----------------------------------------------------------
 
     def _detection_options(self) -> DetectionOptions:
-        """Collective. Margin, skin and friction of the present bodies' pair lists."""
+        """Collective. Margin, skin and friction of pair lists of the bodies present and to come."""
         contact = self.scenario.contact
-        smallest = float(self.state.bodies.radius.min(initial=np.inf))
+        to_come = insertion.thinnest_to_come(self.scenario)
+        smallest = float(self.state.bodies.smallest_size.min(initial=to_come))
         return DetectionOptions(
             margin=contact.margin,
-            skin=contact.skin * self.parallel.min(smallest),
+            skin=contact.skin * _finite(self.parallel.min(smallest)),
             friction=friction_table(self.scenario)[1],
             threads=self.scenario.threads,
             box=PeriodicBox.of(self.scenario.domain),
@@ -364,22 +369,67 @@ class Simulation:
         """Make the next step list near pairs anew, as it does when bodies have moved far."""
         self.state.reference, self._neighbours = None, None
 
-    def _leave_domain(self) -> int:
-        """Collective. Count bodies whose centre is outside the domain, and remove them if asked."""
-        state, domain = self.state, self.scenario.domain
-        position = state.bodies.position
+    # ---- coming and going ------------------------------------------------------------------
+
+    @property
+    def expected(self) -> int:
+        """Number of bodies that are still to come in."""
+        return insertion.total_to_come(self.scenario) - int(self.state.inserted.sum())
+
+    def _let_in(self, time: float) -> int:
+        """Collective. Insert the bodies that are due and find a place; return how many wait."""
+        state = self.state
+        if not self.expected:
+            return 0
+        with self.timer.phase("partition"):
+            arrivals = insertion.arrive(self.parallel, self.scenario, state, time)
+            arrived = int(arrivals.inserted.sum() - state.inserted.sum())
+            state.inserted = arrivals.inserted
+            if arrived:
+                memory = ImpulseMemory.empty(len(arrivals.bodies))
+                state.bodies = Bodies.concatenate([state.bodies, arrivals.bodies])
+                state.memory = ImpulseMemory.concatenate([state.memory, memory])
+                state.rotating = state.rotating or arrivals.spinning
+                self.forget_neighbours()
+        return arrivals.waiting
+
+    def _take_out(self) -> int:
+        """Collective. Take bodies out by their centres: those in a removal region, and those
+        outside the domain if the scene says so. Return how many are outside, removed or not.
+        """
+        state, domain, regions = self.state, self.scenario.domain, self.scenario.removal
+        position = self.wrapped_position()
+        # One row a region, and the last for the domain; a body is in the first that has it.
+        gone = np.zeros((len(regions) + 1, len(state.bodies)), dtype=bool)
+        for row, region in zip(gone, regions, strict=False):
+            row[:] = np.all((position >= region.min) & (position <= region.max), axis=1)
         within = (position >= domain.min) & (position <= domain.max)
         within[:, [axis in domain.periodic for axis in AXES]] = True
-        inside = within.all(axis=1)
-        outside = self.parallel.sum(int(np.count_nonzero(~inside)))
-        if outside and domain.on_leave == "remove":
-            stay = np.flatnonzero(inside)
-            state.bodies, state.memory = state.bodies.take(stay), state.memory.take(stay)
-            state.removed += outside
-            self.forget_neighbours()
-            # A run resumed from here would know the remaining bodies alone.
-            self._detection = self._detection_options()
+        gone[-1] = ~within.all(axis=1)
+        gone[1:] &= ~np.logical_or.accumulate(gone, axis=0)[:-1]
+        count = self.parallel.sum(np.count_nonzero(gone, axis=1))
+        outside = int(count[-1])
+        if domain.on_leave == "keep":
+            gone[-1], count[-1] = False, 0
+        if count.any():
+            self._remove(gone, count)
         return outside
+
+    def _remove(self, gone: NDArray, count: NDArray) -> None:
+        """Collective. Remove bodies: `gone` (regions + 1, n) bool, `count` on all ranks."""
+        state, regions = self.state, len(gone) - 1
+        mass = self.parallel.sum(np.array([state.bodies.mass[row].sum() for row in gone]))
+        stay = np.flatnonzero(~gone.any(axis=0))
+        state.bodies, state.memory = state.bodies.take(stay), state.memory.take(stay)
+        state.removed += int(count.sum())
+        state.removed_mass += float(mass.sum())
+        if len(state.taken) != regions:  # a first step, or a changed scene
+            state.taken, state.taken_mass = np.zeros(regions, np.int64), np.zeros(regions)
+        state.taken = state.taken + count[:-1]
+        state.taken_mass = state.taken_mass + mass[:-1]
+        self.forget_neighbours()
+        # A run resumed from here would know the remaining bodies alone.
+        self._detection = self._detection_options()
 
     # ---- the cone problem ------------------------------------------------------------------
 
@@ -539,7 +589,7 @@ class Simulation:
 
     # ---- records ---------------------------------------------------------------------------
 
-    def _record(self, done: list[_Substep], outside: int, sent: int) -> StepRecord:
+    def _record(self, done: list[_Substep], outside: int, waiting: int, sent: int) -> StepRecord:
         """Collective. Sum up the substeps of a step over ranks."""
         state, parallel, last = self.state, self.parallel, done[-1]
         motion = integrator.measure(parallel, state.bodies)
@@ -574,6 +624,9 @@ class Simulation:
             overlap=max(s.overlap for s in done),
             coincident=int(counts[1]),
             outside=outside,
+            waiting=waiting,
+            removed=state.removed,
+            removed_mass=state.removed_mass,
             substeps=len(done),
             rebuilt=self._rebuilt,
             moved=self._moved,
@@ -602,6 +655,11 @@ class Simulation:
         if self._operator is not None:
             self._operator.destroy()
             self._operator = None
+
+
+def _finite(smallest: float) -> float:
+    """A smallest size [m], 0 where there are no bodies to have one."""
+    return smallest if math.isfinite(smallest) else 0.0
 
 
 def start(parallel: Parallel, bodies: Bodies) -> State:

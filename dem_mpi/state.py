@@ -34,7 +34,10 @@ class State:
     balanced    : imbalance that the last new splitters reached
     wall_impulse: (w, 6) impulse [N s] and torque impulse [N m s] that each face took, on all ranks
     wall_time   : time [s] in which it did, since they were last taken for output
-    flagged     : steps that missed their tolerance; removed : bodies that left the domain
+    flagged     : steps that missed their tolerance
+    inserted    : (groups,) bodies of each group that came in during the run
+    removed, removed_mass : bodies taken out so far, and their mass [kg]
+    taken, taken_mass     : the same by removal region; the rest left the domain
     """
 
     bodies: Bodies
@@ -47,7 +50,11 @@ class State:
     deepest: float = -1.0
     rotating: bool = True
     flagged: int = 0
+    inserted: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     removed: int = 0
+    removed_mass: float = 0.0
+    taken: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    taken_mass: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
     steps_at_rest: int = 0
     balanced: float = 1.0
     wall_impulse: NDArray = field(default_factory=lambda: np.zeros((0, 6)))
@@ -79,6 +86,9 @@ def save(
         "splitter_gid": partition.splitter_gid,
         "wall_impulse": state.wall_impulse,
         "reference_frame": reference.frame if reference is not None else np.zeros(3),
+        "inserted": state.inserted,
+        "taken": state.taken,
+        "taken_mass": state.taken_mass,
     }
     attributes = {
         "layout": _LAYOUT,
@@ -92,6 +102,7 @@ def save(
         "rotating": int(state.rotating),
         "flagged": state.flagged,
         "removed": state.removed,
+        "removed_mass": state.removed_mass,
         "steps_at_rest": state.steps_at_rest,
         "balanced": state.balanced,
         "wall_time": state.wall_time,
@@ -162,7 +173,11 @@ def _state_of(stored: checkpoint.Checkpoint, parallel: Parallel) -> State:
         deepest=float(attributes["deepest"]),
         rotating=bool(attributes["rotating"]),
         flagged=int(attributes["flagged"]),
+        inserted=shared["inserted"],
         removed=int(attributes["removed"]),
+        removed_mass=float(attributes["removed_mass"]),
+        taken=shared["taken"],
+        taken_mass=shared["taken_mass"],
         steps_at_rest=int(attributes["steps_at_rest"]),
         balanced=float(attributes["balanced"]),
         wall_impulse=shared["wall_impulse"],

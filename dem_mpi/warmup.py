@@ -19,6 +19,8 @@ friction: {{default: 0.3}}
 bodies:
   - {{material: m, count: 4, radius: 0.1,
       placement: {{jittered_grid: {{min: [0, 0, 0], max: [0.4, 0.4, 0.2]}}}}}}
+  - {{material: m, count: 1, radius: 0.1,
+      placement: {{insertion: {{min: [0.5, 0.5, 0], max: [0.8, 0.8, 0.3], rate: 1}}}}}}
 walls:
   - {{shape: plane, material: m, point: [0, 0, 0], normal: [0, 0, 1],
       motion: {{velocity: [0, 0, 0.1]}}}}
