@@ -585,9 +585,10 @@ def test_flipped_bits_end_in_a_refusal_or_a_solve(parallel, tmp_path):
         try:
             outcomes.append(solve_file(parallel, path, options, quiet))
         except DataError as error:
-            assert "\n" not in str(error)
-            outcomes.append(65)
-    assert set(outcomes) == {65, 70} and outcomes.count(65) > 60
+            outcomes.append(str(error))
+    refused = [text for text in outcomes if isinstance(text, str)]
+    assert len(refused) > 60 and not any("\n" in text for text in refused)
+    assert {code for code in outcomes if isinstance(code, int)} <= {0, 70}
 
 
 # ---- scales and edges ------------------------------------------------------------------------
