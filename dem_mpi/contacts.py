@@ -34,6 +34,7 @@ class DetectionOptions:
     """What decides which pairs are listed and which are contacts.
 
     margin : c, in smaller radii; skin : [m]; friction : (materials, materials) table of mu
+    general : whether bodies may be other than spheres
     box    : the periodic box, None where no axis repeats
     """
 
@@ -42,6 +43,7 @@ class DetectionOptions:
     friction: NDArray
     threads: int = 1
     box: PeriodicBox | None = None
+    general: bool = False
 
     @property
     def largest_friction(self) -> float:
@@ -79,7 +81,7 @@ class Reference:
         frame = total[:3] / max(total[3], 1.0)
         reach = np.empty(len(bodies))
         kernels.reach_speed(
-            predicted, bodies.angular_velocity, bodies.radius, frame,
+            predicted, bodies.angular_velocity, bodies.bounding_radius, frame,
             options.largest_friction, step, reach,
         )  # fmt: skip
         return cls(bodies.position.copy(), reach, frame)
@@ -90,7 +92,7 @@ class Reference:
         """Return the largest displacement plus growth of the margin of an owned body [m]."""
         reach = np.empty(len(bodies))
         kernels.reach_speed(
-            predicted, bodies.angular_velocity, bodies.radius, self.frame,
+            predicted, bodies.angular_velocity, bodies.bounding_radius, self.frame,
             options.largest_friction, step, reach,
         )  # fmt: skip
         return float(kernels.largest_drift(bodies.position, self.position, reach, self.reach))
@@ -105,8 +107,11 @@ class Neighbours:
     neighbour[offset[a]:offset[a + 1]], in ascending gid, and those with several images of one
     body in order of the image.
 
+    radius : (n + g,) [m] of the bounding spheres
+    inverse_inertia : (n + g,) of spheres; (n + g, 2) across and along the axis of general bodies
     shift : (g, 3) [m] displacement of the ghosts from the bodies they are images of; None where
             no axis is periodic
+    form  : (n + g, 3) shape, radius, half length of general bodies; None where all are spheres
     """
 
     reference: Reference
@@ -119,6 +124,7 @@ class Neighbours:
     offset: NDArray
     neighbour: NDArray
     shift: NDArray | None = None
+    form: NDArray | None = None
 
     @property
     def pairs(self) -> int:
@@ -152,7 +158,8 @@ class ContactSet:
     other      : (m,) int64 gid of b, or the wall's id
     row        : (n + 1,) int64; contacts of owned body k are row[k]:row[k + 1]
     normal     : (m, 3) from a to b;  gap : (m,) [m];  friction : (m,)
-    arm        : (m, 2) [m] from each centre to the common point in the middle of the gap
+    arm        : (m, 2) [m] from each centre to the common point in the middle of the gap, along
+                 the normal; (m, 6) vectors from a and from b where bodies may not be spheres
     coincident : number of contacts whose centres coincide (their normal is e_z by convention)
     """
 
@@ -199,10 +206,9 @@ def find_neighbours(
     owned = len(bodies)
     # Two bodies are near iff their distance <= r + r + max(c min(r, r), reach + reach) + skin,
     # which is at most the sum of these two effective radii.
+    radius = bodies.bounding_radius
     effective = (
-        bodies.radius
-        + np.maximum(0.5 * options.margin * bodies.radius, reference.reach)
-        + 0.5 * options.skin
+        radius + np.maximum(0.5 * options.margin * radius, reference.reach) + 0.5 * options.skin
     )
     largest = parallel.max(float(effective.max(initial=0.0)))
     _check_period(options.box, 2.0 * largest)
@@ -215,13 +221,14 @@ def find_neighbours(
         reference=reference,
         halo=halo,
         gid=bodies.gid,
-        radius=bodies.radius,
+        radius=radius,
         material=bodies.material,
         inverse_mass=1.0 / bodies.mass,
-        inverse_inertia=1.0 / bodies.inertia,
+        inverse_inertia=_inverse_inertia(bodies, options.general),
         offset=np.zeros(owned + 1, dtype=np.int64),
         neighbour=np.empty(0, dtype=np.int32),
         shift=shift,
+        form=_form(bodies) if options.general else None,
     )
     gid, radius = static.extend(static.gid), static.extend(static.radius)
     position, reach = static.extend_position(reference.position), static.extend(reference.reach)
@@ -248,7 +255,20 @@ def find_neighbours(
         offset=offset,
         neighbour=neighbour,
         shift=None if shift is None else shift[needed[owned:]],
+        form=None if static.form is None else static.extend(static.form)[needed],
     )
+
+
+def _inverse_inertia(bodies: Bodies, general: bool) -> NDArray:
+    """(n,) of spheres, or (n, 2) across and along the axis [1/(kg m^2)]."""
+    if general:
+        return 1.0 / np.stack((bodies.inertia, bodies.axial_inertia), axis=1)
+    return 1.0 / bodies.inertia
+
+
+def _form(bodies: Bodies) -> NDArray:
+    """(n, 3): shape, radius and half length of bodies of any shape."""
+    return np.stack((bodies.shape, bodies.radius, bodies.half_length), axis=1, dtype=np.float64)
 
 
 def _check_period(box: PeriodicBox | None, interaction: float) -> None:

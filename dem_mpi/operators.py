@@ -227,6 +227,13 @@ class Assembled:
             item.destroy()
 
 
+def world_inverse_inertia(axis: NDArray, inverse_inertia: NDArray, threads: int = 1) -> NDArray:
+    """Return (n, 6) in the world frame from (n, 2), across and along the unit `axis` (n, 3)."""
+    world = np.empty((len(axis), 6))
+    rigid.world_inverse_inertia.using(threads)(axis, inverse_inertia, world)
+    return world
+
+
 def _is_general(contacts: ContactSet) -> bool:
     """Whether bodies may be other than spheres."""
     return contacts.arm.shape[1] == 6

@@ -219,3 +219,8 @@ def frictional(scenario: Scenario) -> bool:
     bodies = [names.index(group.material) for group in scenario.bodies]
     walls = [names.index(wall.material) for wall in scenario.walls]
     return bool((table[np.ix_(bodies, bodies + walls)] > 0).any())
+
+
+def only_spheres(scenario: Scenario) -> bool:
+    """Whether every body that the scene has or will have is a sphere."""
+    return all(group.shape == "sphere" for group in scenario.bodies)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dem_mpi import _kernels_solver as kernels
-from dem_mpi import insertion, integrator
+from dem_mpi import insertion, integrator, shapes
 from dem_mpi.bodies import Bodies, ImpulseMemory
 from dem_mpi.cone import ConeProblem, Tolerance, median_of_positive
 from dem_mpi.contacts import (
@@ -31,11 +31,13 @@ from dem_mpi.contacts import (
 )
 from dem_mpi.errors import DemError
 from dem_mpi.metrics import PhaseTimer
-from dem_mpi.operators import Assembled, MatrixFree
+from dem_mpi.narrow_phase import find_general_contacts
+from dem_mpi.operators import Assembled, MatrixFree, world_inverse_inertia
 from dem_mpi.parallel import Parallel
 from dem_mpi.partition import balance, imbalance, migrate
 from dem_mpi.periodic import AXES, PeriodicBox
 from dem_mpi.scenario import Scenario, friction_table, frictional
+from dem_mpi.scene_models import only_spheres
 from dem_mpi.solvers.apgd import Apgd, ApgdOptions
 from dem_mpi.solvers.result import SolveReport
 from dem_mpi.state import State
@@ -150,6 +152,9 @@ class Simulation:
         self.timer = PhaseTimer()
         self.frictional = frictional(scenario)
         self._columns = 3 if self.frictional else 1
+        # Normal impulses turn bodies that are not spheres: these always have six freedoms.
+        self._general = not only_spheres(scenario)
+        state.rotating = state.rotating or self._general
         self._gravity = np.array(scenario.gravity)
         self._faces = wall_faces(scenario)
         if state.wall_impulse.shape[0] != len(self._faces.name):
@@ -227,7 +232,7 @@ class Simulation:
             bodies, spin = self.state.bodies, self.state.bodies.angular_velocity
             u = posed.operator.body_velocity(report.impulse)[: len(bodies)]
             new_velocity = posed.predicted + u[:, :3]
-            new_spin = spin + u[:, 3:] if self.frictional else spin
+            new_spin = spin + u[:, 3:] if u.shape[1] == 6 else spin
             before = integrator.kinetic_energy(bodies, posed.predicted, spin)
             after = integrator.kinetic_energy(bodies, new_velocity, new_spin)
             work = 0.0 if posed.b_wall is None else -float(np.sum(report.impulse * posed.b_wall))
@@ -264,11 +269,17 @@ class Simulation:
             position = neighbours.extend_position(bodies.position)
             velocity = neighbours.extend(predicted)
             spin = self._extend_spin(neighbours)
-            contacts = find_contacts(
-                neighbours, position, velocity, spin, walls, self._detection, h
-            )
+            inverse_inertia = neighbours.inverse_inertia
+            surroundings = (velocity, spin, walls, self._detection, h)
+            if self._general:
+                threads = self.scenario.threads
+                axis = neighbours.extend(integrator.symmetry_axes(bodies, threads))
+                inverse_inertia = world_inverse_inertia(axis, inverse_inertia, threads)
+                contacts = find_general_contacts(neighbours, position, axis, *surroundings)
+            else:
+                contacts = find_contacts(neighbours, position, *surroundings)
         with timer.phase("assemble"):
-            operator = self._make_operator(contacts, neighbours)
+            operator = self._make_operator(contacts, neighbours, inverse_inertia)
             problem, b_gap, b_wall, overlap = self._make_problem(
                 operator, contacts, velocity, spin, walls, h
             )
@@ -310,6 +321,7 @@ class Simulation:
             friction=friction_table(self.scenario)[1],
             threads=self.scenario.threads,
             box=PeriodicBox.of(self.scenario.domain),
+            general=self._general,
         )
 
     def _update_neighbours(self, h: float) -> None:
@@ -440,14 +452,15 @@ class Simulation:
         return np.zeros((neighbours.halo.owned + neighbours.halo.ghosts, 3))
 
     def _make_operator(
-        self, contacts: ContactSet, neighbours: Neighbours
+        self, contacts: ContactSet, neighbours: Neighbours, inverse_inertia: NDArray
     ) -> MatrixFree | Assembled:
         """Collective. N for these contacts; an assembled pattern is kept while the graph stands."""
-        masses = (neighbours.inverse_mass, neighbours.inverse_inertia, neighbours.halo)
+        masses = (neighbours.inverse_mass, inverse_inertia, neighbours.halo)
         if self.scenario.contact.operator == "matrix_free":
             return MatrixFree(contacts, *masses, self.frictional, self.scenario.threads)
         kept = self._operator if isinstance(self._operator, Assembled) else None
-        if kept is not None and not self._rebuilt and kept.refill(contacts):
+        turned = inverse_inertia if self._general else None
+        if kept is not None and not self._rebuilt and kept.refill(contacts, turned):
             return kept
         if kept is not None:
             kept.destroy()
@@ -469,7 +482,8 @@ class Simulation:
         b_phi (m,), b_wall (m, columns) or None, and the deepest overlap in smaller radii.
         """
         b = np.empty((contacts.count, self._columns))
-        motion = np.hstack((velocity, spin)) if self.frictional else velocity
+        turning = self.frictional or self._general
+        motion = np.hstack((velocity, spin)) if turning else velocity
         operator.contact_velocity(motion, b)
         b_wall = None
         wall_velocity = contact_velocity_of_walls(contacts, self.state.bodies.position, walls)
@@ -483,10 +497,7 @@ class Simulation:
         if recovery is not None:
             np.maximum(b_gap, -recovery, out=b_gap)
         b[:, 0] += b_gap
-        smaller = contacts.arm[:, 0] - 0.5 * contacts.gap
-        pair = contacts.b >= 0
-        smaller[pair] = np.minimum(smaller[pair], (contacts.arm[:, 1] - 0.5 * contacts.gap)[pair])
-        overlap = float(np.max(-contacts.gap / smaller, initial=0.0))
+        overlap = float(np.max(-contacts.gap / self._smaller_size(contacts), initial=0.0))
         largest = self.parallel.max(np.array([fastest, overlap]))
         v_ref = max(h * float(np.linalg.norm(self._gravity)), float(largest[0]))
         if v_ref == 0.0:
@@ -497,6 +508,19 @@ class Simulation:
             operator, b, contacts.friction, v_ref, gamma_ref, self.parallel, self.scenario.threads
         )
         return problem, b_gap, b_wall, float(largest[1])
+
+    def _smaller_size(self, contacts: ContactSet) -> NDArray:
+        """Return the radius (m,) [m] of the largest sphere inside the smaller body."""
+        pair = contacts.b >= 0
+        neighbours = self._neighbours
+        if neighbours is not None and neighbours.form is not None:
+            size = shapes.smallest_size(*neighbours.form.T)
+            smaller = size[contacts.a]
+            smaller[pair] = np.minimum(smaller[pair], size[contacts.b[pair]])
+            return smaller
+        smaller = contacts.arm[:, 0] - 0.5 * contacts.gap
+        smaller[pair] = np.minimum(smaller[pair], (contacts.arm[:, 1] - 0.5 * contacts.gap)[pair])
+        return smaller
 
     def _guess(self, contacts: ContactSet, h: float) -> NDArray:
         """Impulses of the last step where the contacts stand, scaled with the step length."""
@@ -575,7 +599,7 @@ class Simulation:
         allowed = max(_RUNAWAY_OVERLAP, 1.05 * self.state.deepest)
         if self.state.deepest < 0.0 or overlap <= allowed:
             return
-        depth = -contacts.gap / self.state.bodies.radius[contacts.a]
+        depth = -contacts.gap / self.state.bodies.smallest_size[contacts.a]
         low, high = self._worst_contact(contacts, depth)
         raise SolverFailureError(
             f"step {self.state.step + 1}: an overlap of {overlap:.2g} radii, over {allowed:.2g}, "
