@@ -30,6 +30,7 @@ from dem_mpi._kernels_vectors import (
     vec,
 )
 from dem_mpi._kernels_wall_points import (
+    crossings,
     frustum_frame,
     on_frustum,
     on_rectangle,
@@ -380,7 +381,7 @@ def _rod_face(X, d, l, k, cos, sin):  # noqa: E741
 
 @jit
 def _rod_on_frustum(x, d, s, g, hidden):
-    """`on_frustum` for the point at abscissa s, without what lies behind a body out of reach."""
+    """`on_frustum` for the point at abscissa s, without what is hidden behind the surface."""
     distance, n, clamped, height = on_frustum(along(x, s, d), g)
     if hidden and not clamped and height < 0.0:
         distance = np.inf
@@ -396,6 +397,9 @@ def rod_frustum(x, d, r, l, g, limit, hidden, out):  # noqa: E741
     """
     X, k = sub(x, vec(g[0:3])), vec(g[3:6])
     L, _, _, _, cos, sin = frustum_frame(g)
+    crosses, pierces = crossings(along(x, -l, d), along(x, l, d), g, 0.0)
+    if crosses:  # what reached the back round a rim has not gone through the surface
+        hidden = not pierces
     waist = _rod_face(X, d, l, k, cos, sin) if g[9] < 0.0 and L > 0.0 else np.nan
     base1, base2 = _rod_rim(X, d, l, k, 0.0, g[7])
     top1, top2 = _rod_rim(X, d, l, k, L, g[8])

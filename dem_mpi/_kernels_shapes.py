@@ -149,7 +149,7 @@ def wall_contacts(wall_kind, g, kind, x, d, r, l, limit, out):  # noqa: E741
     if half == 0.0 and kind != SPHEROID:
         rod_contact(n, distance - r, 0.0, d, r, out, 0)
         return 1
-    hidden = behind(clamped, height, reach)
+    hidden = behind(clamped, height, smallest_size(kind, r, l))
     if wall_kind == RECTANGLE:
         if kind == SPHEROID:
             return spheroid_rectangle(x, d, r, l, g, limit, out)

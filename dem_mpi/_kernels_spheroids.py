@@ -21,6 +21,7 @@ from dem_mpi._kernels_vectors import (
     clamp,
     cross,
     dot,
+    meridian,
     neg,
     norm,
     put,
@@ -31,8 +32,8 @@ from dem_mpi._kernels_vectors import (
     vec,
 )
 from dem_mpi._kernels_wall_points import (
+    crossings,
     frustum_frame,
-    meridian,
 )
 
 _ARCS = 32  # arcs of a circle searched for one extremum each
@@ -101,10 +102,7 @@ def spheroid_foot(y, d, a, c):
     delta < 0 inside; n is the outward normal at the closest point `foot` of the surface. Where
     several are closest one is taken: the upper on the equatorial plane, any around the axis.
     """
-    s = dot(y, d)
-    e = along(y, -s, d)
-    rho = norm(e)
-    radial = scaled(1.0 / rho, e) if rho > 0.0 else across(d)
+    s, rho, radial = meridian(y, d)
     foot_s, foot_rho, n_s, n_rho, delta = meridian_foot(s, rho, a, c)
     n = along(scaled(n_s, d), n_rho, radial)
     return delta, n, along(scaled(foot_s, d), foot_rho, radial)
@@ -320,6 +318,28 @@ def spheroid_plane(X, d, a, c, m):
 
 
 @jit
+def _over_face(Y, e1, e2, margin):
+    """Whether Y, relative to the centre of a rectangle, projects into it."""
+    return abs(dot(Y, e1)) <= dot(e1, e1) + margin * norm(e1) and abs(dot(Y, e2)) <= (
+        dot(e2, e2) + margin * norm(e2)
+    )
+
+
+@jit
+def _passes_edge(X, foot, gap, a, c, m, e1, e2):
+    """Whether the lowest point of a body is under the plate by way of an edge, not of the face.
+
+    So it is if the line to it from the centre crosses the plane outside the rectangle.
+    """
+    if gap >= 0.0:
+        return False
+    height = dot(X, m)
+    lowest = along(foot, 0.5 * gap, m)
+    Y = along(X, height / (height - gap), sub(lowest, X))
+    return not _over_face(Y, e1, e2, MERGE * min(a, c))
+
+
+@jit
 def spheroid_rectangle(x, d, a, c, g, limit, out):
     """The face where the lowest point stands above it, else the nearest of the four edges.
 
@@ -333,7 +353,7 @@ def spheroid_rectangle(x, d, a, c, g, limit, out):
     gap, point = spheroid_plane(X, d, a, c, m)
     foot = along(X, 1.0, point)
     n = neg(m)
-    if abs(dot(foot, e1)) > dot(e1, e1) or abs(dot(foot, e2)) > dot(e2, e2):
+    if not _over_face(foot, e1, e2, 0.0) or _passes_edge(X, foot, gap, a, c, m, e1, e2):
         gap = np.inf
         l1, l2 = norm(e1), norm(e2)
         u1, u2 = scaled(1.0 / l1, e1), scaled(1.0 / l2, e2)
@@ -420,22 +440,24 @@ def _climb(rim, low, high, X, d, a, c, k, e1, e2, p, q, side):
 def _peaks(rim, window, X, d, a, c, k, e1, e2, p, q, side, peak):
     """Fill `peak` with azimuths of local maxima within +-window of e1; return how many.
 
-    One is found in each arc over which the slope turns from rising to falling. A function that is
-    constant (a body on the axis) is given two opposite azimuths.
+    One is found in each arc over which the slope turns from rising to falling; those of a full
+    circle begin beside the directions of symmetry, where the slope's sign would be round-off. A
+    function that is constant (a body on the axis) is given two opposite azimuths.
     """
     count = 0
     tolerance = 1e-13 * (q if rim else p * (a + c + norm(X)))
+    shift = 0.37 * window / _ARCS if window == np.pi else 0.0
     steepest = 0.0
     previous = 0.0
     for i in range(_ARCS + 1):
-        phi = window * (2.0 * i / _ARCS - 1.0)
+        phi = shift + window * (2.0 * i / _ARCS - 1.0)
         if rim:
             slope = _rim_delta(phi, X, d, a, c, k, e1, e2, p, q)[1]
         else:
             slope = _face_slope(phi, X, d, a, c, k, e1, e2, p, q, side)[1]
         steepest = max(steepest, abs(slope))
         if i > 0 and previous > 0.0 and slope <= 0.0 and count < peak.shape[0]:
-            low = window * (2.0 * (i - 1) / _ARCS - 1.0)
+            low = shift + window * (2.0 * (i - 1) / _ARCS - 1.0)
             peak[count] = _climb(rim, low, phi, X, d, a, c, k, e1, e2, p, q, side)
             count += 1
         previous = slope
@@ -446,6 +468,19 @@ def _peaks(rim, window, X, d, a, c, k, e1, e2, p, q, side, peak):
 
 
 @jit
+def _through_face(X, surface, gap, a, c, g):
+    """Whether a point of a body reached the back of a frustum, if so, through it: not round a rim.
+
+    X and the point are relative to the base and to the centre of the body.
+    """
+    if gap >= 0.0:
+        return True
+    x = along(vec(g[0:3]), 1.0, X)
+    crosses, pierces = crossings(x, along(x, 1.0, surface), g, MERGE * min(a, c))
+    return pierces or not crosses
+
+
+@jit
 def _spheroid_face(X, d, a, c, g, k, e1, e2, limit, peak, found, count):
     """Append the contacts with the surface of a frustum between its rims; return their number."""
     L, slant, us, ur, cos, sin = frustum_frame(g)
@@ -453,8 +488,9 @@ def _spheroid_face(X, d, a, c, g, k, e1, e2, limit, peak, found, count):
     if L == 0.0:
         m = scaled(side, k)
         gap, point = spheroid_plane(X, d, a, c, m)
-        f = ur * (meridian(along(X, 1.0, point), k)[1] - r0)
-        if gap <= limit and 0.0 <= f <= slant:
+        surface = along(point, 0.5 * gap, m)
+        f = ur * (meridian(along(X, 1.0, surface), k)[1] - r0)
+        if gap <= limit and 0.0 <= f <= slant and _through_face(X, surface, gap, a, c, g):
             put(found, count, neg(m), gap, point)
             count += 1
         return count
@@ -473,7 +509,7 @@ def _spheroid_face(X, d, a, c, g, k, e1, e2, limit, peak, found, count):
         surface = _support(n, d, a, c)[1]
         Y = along(X, 1.0, surface)
         f = us * dot(Y, k) + ur * (dot(Y, radial) - r0)
-        if 0.0 <= f <= slant:
+        if 0.0 <= f <= slant and _through_face(X, surface, gap, a, c, g):
             put(found, count, n, gap, along(surface, 0.5 * gap, n))
             count += 1
         if side < 0.0:
@@ -482,11 +518,12 @@ def _spheroid_face(X, d, a, c, g, k, e1, e2, limit, peak, found, count):
 
 
 @jit
-def _spheroid_rim(top, X, d, a, c, g, k, e1, e2, limit, peak, found, count):
+def _spheroid_rim(top, alone, X, d, a, c, g, k, e1, e2, limit, peak, found, count):
     """Append the contacts with one rim of a frustum; return their number.
 
     A rim ends the surface: it is touched from the outside of the meridian segment only, the
-    inside belongs to the face.
+    inside belongs to the face. An overlapping rim without a contact on the face counts anyhow:
+    deep in a thin body its nearest way out may point either way.
     """
     L, _, us, ur, _, _ = frustum_frame(g)
     rim_s, rim_r = (L, g[8]) if top else (0.0, g[7])
@@ -510,7 +547,7 @@ def _spheroid_rim(top, X, d, a, c, g, k, e1, e2, limit, peak, found, count):
         q = sub(along(scaled(rim_s, k), rim_r, radial), X)
         delta, n, surface = spheroid_foot(q, d, a, c)
         inward = outward * (us * dot(n, k) + ur * dot(n, radial))
-        if delta <= limit and inward <= 1e-9:
+        if delta <= limit and (inward <= 1e-9 or (alone and delta < 0.0)):
             put(found, count, n, delta, along(surface, 0.5 * delta, n))
             count += 1
     return count
@@ -530,8 +567,9 @@ def spheroid_frustum(x, d, a, c, g, limit, hidden, out):
     count = 0
     if not hidden:
         count = _spheroid_face(X, d, a, c, g, k, e1, e2, limit, peak, found, count)
-    count = _spheroid_rim(False, X, d, a, c, g, k, e1, e2, limit, peak, found, count)
-    count = _spheroid_rim(True, X, d, a, c, g, k, e1, e2, limit, peak, found, count)
+    alone = count == 0
+    count = _spheroid_rim(False, alone, X, d, a, c, g, k, e1, e2, limit, peak, found, count)
+    count = _spheroid_rim(True, alone, X, d, a, c, g, k, e1, e2, limit, peak, found, count)
     if count == 0:
         return 0
     first = 0

@@ -82,6 +82,25 @@ def across(d):
 
 
 @jit
+def meridian(X, k):
+    """Return (s, rho, radial) of X about the unit axis k through 0.
+
+    Near the axis the part of X across it is round-off that may point anywhere: it is made
+    perpendicular once more.
+    """
+    s = dot(X, k)
+    e = along(X, -s, k)
+    rho = norm(e)
+    if not rho > 1e-8 * abs(s):
+        e = unit(e)
+        e = along(e, -dot(e, k), k)
+        if not norm(e) > 0.5:
+            e = across(k)
+        return s, rho, unit(e)
+    return s, rho, scaled(1.0 / rho, e)
+
+
+@jit
 def put(out, row, n, gap, point):
     out[row, 0], out[row, 1], out[row, 2] = n
     out[row, 3] = gap

@@ -10,10 +10,10 @@ import numpy as np
 
 from dem_mpi._jit import jit
 from dem_mpi._kernels_vectors import (
-    across,
     along,
     clamp,
     dot,
+    meridian,
     neg,
     norm,
     scaled,
@@ -56,15 +56,6 @@ def frustum_frame(g):
 
 
 @jit
-def meridian(X, k):
-    """Return (s, rho, radial) of X about the unit axis k through 0."""
-    s = dot(X, k)
-    e = along(X, -s, k)
-    rho = norm(e)
-    return s, rho, (scaled(1.0 / rho, e) if rho > 0.0 else across(k))
-
-
-@jit
 def on_frustum(P, g):
     """Return (distance, n, clamped, height) from a point P to a frustum, n towards it.
 
@@ -89,10 +80,39 @@ def on_frustum(P, g):
 
 
 @jit
-def behind(clamped, height, reach):
+def behind(clamped, height, depth):
     """Whether a body whose centre stands so has the surface of a frustum behind it, untouched.
 
-    Next to the surface a centre is behind when deeper than the body's own reach; beyond a rim,
-    where a body may well pass to the other side, as soon as it is on the wrong side.
+    Beside the surface it is behind when deeper than `depth`, its smallest size: less may be an
+    overlap to be undone. Beyond a rim any body may pass to the other side.
     """
-    return height < (0.0 if clamped else -reach)
+    return height < (0.0 if clamped else -depth)
+
+
+@jit
+def crossings(P, Q, g, margin):
+    """Return (crosses, pierces): does segment P Q meet a frustum continued beyond its rims, and
+    does it meet it between them, give or take `margin`?
+
+    On the segment cos rho(t) = cos r0 + sin s(t), squared: two roots.
+    """
+    X, V, k = sub(P, vec(g[0:3])), sub(Q, P), vec(g[3:6])
+    L, slant, us, ur, cos, sin = frustum_frame(g)
+    s0, s1 = dot(X, k), dot(V, k)
+    e0, e1 = along(X, -s0, k), along(V, -s1, k)
+    level = cos * g[7] + sin * s0
+    A = cos * cos * dot(e1, e1) - (sin * s1) ** 2
+    B = cos * cos * dot(e0, e1) - sin * s1 * level
+    C = cos * cos * dot(e0, e0) - level * level
+    if L == 0.0:
+        first = second = -s0 / s1
+    else:
+        q = -(B + np.copysign(np.sqrt(B * B - A * C), B))
+        first, second = q / A, C / q
+    crosses, pierces = False, False
+    for t in (first, second):
+        if 0.0 <= t <= 1.0 and (L == 0.0 or level + sin * s1 * t >= 0.0):
+            crosses = True
+            f = us * (s0 + t * s1) + ur * (norm(along(e0, t, e1)) - g[7])
+            pierces = pierces or -margin <= f <= slant + margin
+    return crosses, pierces

@@ -133,14 +133,14 @@ def support(n: NDArray, d: NDArray, a: float, c: float) -> NDArray:
 def segment_pair_distance(
     D: NDArray, da: NDArray, la: float, db: NDArray, lb: float
 ) -> tuple[float, float]:
-    """(s, distance) of two segments: least over s, the other segment's nearest point closed form."""  # noqa: E501
+    """(s, distance) of two segments: least over s of the distance from the other segment."""
 
     def distance(u: NDArray) -> NDArray:
         p = u[:, :1] * da - D
         t = np.clip(p @ db, -lb, lb)
         return np.linalg.norm(p - t[:, None] * db, axis=1)
 
-    u, best = zoom(distance, [-la], [la])
+    u, best = zoom(distance, [-la], [la], width=1e-13)
     return float(u[0]), best
 
 
@@ -148,7 +148,9 @@ def spheroid_segment_distance(
     y: NDArray, e: NDArray, half: float, d: NDArray, a: float, c: float
 ) -> tuple[float, float]:
     """(t, delta): the least signed distance of points y + t e, |t| <= half, from a spheroid."""
-    u, best = zoom(lambda u: spheroid_distance(y + u * e, d, a, c), [-half], [half], 201, 9)
+    u, best = zoom(
+        lambda u: spheroid_distance(y + u * e, d, a, c), [-half], [half], 201, 9, width=1e-13
+    )
     return float(u[0]), best
 
 
@@ -213,7 +215,7 @@ def rod_wall_gap(
     distance: Callable[[NDArray], NDArray], x: NDArray, d: NDArray, r: float, half: float
 ) -> float:
     """Least distance of the points of a core from a wall, less the radius."""
-    return zoom(lambda u: distance(x + u * d), [-half], [half], 2001)[1] - r
+    return zoom(lambda u: distance(x + u * d), [-half], [half], 2001, width=1e-13)[1] - r
 
 
 def spheroid_wall_gap(
