@@ -16,13 +16,16 @@ import pytest
 from dem_mpi import state as states
 from dem_mpi.bodies import Bodies
 from dem_mpi.contacts import PeriodTooShortError, find_neighbours
+from dem_mpi.errors import InputError
 from dem_mpi.operators import Assembled, MatrixFree
 from dem_mpi.parallel import Halo, Parallel
 from dem_mpi.periodic import ITSELF, PeriodicBox
 from dem_mpi.simulation import Simulation, SolverFailureError, redistribute
+from dem_mpi.trajectory import read_frame
 
 from contact_twins import CONTACT, cloud, detect, detection, gathered, measure, table_of
-from scenes import everybody, scene, simulation_of, state_of
+from runs import simulate
+from scenes import FLOOR, everybody, load, scene, simulation_of, state_of
 
 ranks_1_2_3_8 = pytest.mark.mpi(ranks=[1, 2, 3, 8])
 
@@ -326,9 +329,10 @@ def face_centred_cubic(side: int) -> tuple[np.ndarray, float]:
 
 
 CRYSTALS = {
-    "simple cubic, 2": (lambda: simple_cubic(2), 3),
-    "simple cubic, 4": (lambda: simple_cubic(4), 3),
-    "fcc, 2": (lambda: face_centred_cubic(2), 6),
+    "simple cubic, 2": (lambda: simple_cubic(2), 3, "matrix_free"),
+    "simple cubic, 2, assembled": (lambda: simple_cubic(2), 3, "assembled"),
+    "simple cubic, 4": (lambda: simple_cubic(4), 3, "matrix_free"),
+    "fcc, 2": (lambda: face_centred_cubic(2), 6, "matrix_free"),
 }
 
 
@@ -336,10 +340,12 @@ CRYSTALS = {
 @pytest.mark.parametrize("name", CRYSTALS)
 def test_a_crystal_of_touching_spheres_stays_whole_while_it_drifts_around_the_box(parallel, name):
     """1000 steps, five times around; each body keeps its 6 or 12 contacts through all faces."""
-    make, contacts_each = CRYSTALS[name]
+    make, contacts_each, operator = CRYSTALS[name]
     position, period = make()
     drift = np.array([1.0, -0.7, 0.4]) * period * 5.0
-    scenario = scene(step=1e-3, mu=0.5, gravity=(0, 0, 0), domain=cube(period))
+    scenario = scene(
+        step=1e-3, mu=0.5, gravity=(0, 0, 0), domain=cube(period), contact={"operator": operator}
+    )
     simulation = simulation_of(scenario, position, 0.05, drift, parallel=parallel)
     for _ in range(1000):
         record = simulation.step()
@@ -425,6 +431,23 @@ def test_a_collision_across_a_corner_is_the_collision_in_the_middle(parallel):
         assert np.max(np.abs(one - other)) < 1e-7
 
 
+@pytest.mark.mpi(ranks=[1, 3])
+def test_a_layer_slides_down_an_endless_smooth_incline(parallel):
+    """The incline is level and gravity oblique: v = g_x t, however often the layer comes around."""
+    scenario = scene(
+        step=2e-3, gravity=(6.0, 0, -9.81), domain=cube(0.3, "xy"), walls=[FLOOR],
+        contact={"tolerance": 1e-8, "complementarity": 1e-8},
+    )  # fmt: skip
+    position = simple_cubic(3)[0][2::3] * [1, 1, 0] + [0, 0, 0.05]
+    simulation = simulation_of(scenario, position, 0.05, parallel=parallel)
+    for _ in range(500):
+        record = simulation.step()
+        assert record.contacts == 9 + 18
+    last = everybody(parallel, simulation.state)
+    # Each of 500 steps is solved to 1e-8 m/s.
+    assert np.max(np.abs(last.velocity - [6.0, 0.0, 0.0])) < 500 * 1e-8
+
+
 # ---- going on ------------------------------------------------------------------------------
 
 
@@ -472,3 +495,74 @@ def test_the_pair_list_of_a_scene_without_periodic_axes_has_no_images():
     options = simulation._detection
     neighbours = find_neighbours(parallel, state.partition, state.bodies, state.reference, options)
     assert options.box is None and neighbours.shift is None and neighbours.halo.ghosts == 0
+
+
+# ---- scenes --------------------------------------------------------------------------------
+
+BODIES = {
+    "material": "m",
+    "count": 8,
+    "radius": 0.05,
+    "placement": {"jittered_grid": {"min": [0, 0, 0], "max": [0.3, 0.3, 0.3]}},
+}
+BOX = {"shape": "box", "material": "m", "min": [0, 0, 0], "max": [1, 1, 1]}
+PLANE = {"shape": "plane", "material": "m", "point": [0, 0, 0]}
+TURN = {"rotation": {"centre": [0, 0, 0], "axis": [0, 0, 1], "rate": 1.0}}
+
+
+@pytest.mark.parametrize(
+    ("sections", "rule"),
+    [
+        ({"domain": cube(0.105)}, "repeats every 0.105 m, but bodies interact over up to 0.111 m"),
+        ({"walls": [{**BOX, "open": ["x_min"]}]}, "periodic along x: add x_max"),
+        ({"walls": [{**PLANE, "normal": [0.1, 0, 1]}]}, "must not cut the periodic axis x"),
+        ({"walls": [{**PLANE, "normal": [0, 0, 1], "motion": TURN}]}, "other than the periodic"),
+    ],
+    ids=["short period", "closed box", "oblique plane", "turning plane"],
+)
+def test_scenes_that_do_not_repeat_are_refused(sections, rule):
+    with pytest.raises(InputError, match=rule):
+        load(**{"domain": cube(1.0, "x"), "bodies": [BODIES], **sections})
+
+
+@pytest.mark.parametrize(
+    ("wall", "doubted"),
+    [
+        ({"shape": "rectangle", "corner": [0, 0, 0], "edges": [[1, 0, 0], [0, 1, 0]]}, True),
+        ({"shape": "rectangle", "corner": [-0.2, 0, 0], "edges": [[1.4, 0, 0], [0, 1, 0]]}, False),
+        ({"shape": "rectangle", "corner": [0.3, 0, 0], "edges": [[0.4, 0, 0], [0, 1, 0]]}, False),
+        ({"shape": "cylinder", "start": [0, 0, 0], "end": [1, 0, 0], "radius": 0.5}, True),
+        ({"shape": "cylinder", "start": [-1, 0, 0], "end": [2, 0, 0], "radius": 0.5}, False),
+        ({"shape": "ring", "centre": [0.5, 0, 0], "normal": [0, 0, 1], "radii": [0, 0.46]}, True),
+        ({"shape": "ring", "centre": [0.5, 0, 0], "normal": [1, 0, 0], "radii": [0, 0.9]}, False),
+    ],
+)
+def test_finite_walls_that_end_near_a_periodic_face_are_doubted(wall, doubted):
+    group = {**BODIES, "placement": {"jittered_grid": {"min": [0.1] * 3, "max": [0.4] * 3}}}
+    sections = {"domain": cube(1.0, "x"), "gravity": (0, 0, 0), "bodies": [group]}
+    loaded = load(walls=[{"material": "m", **wall}], **sections)
+    assert any("walls do not repeat" in text for text in loaded.warnings) == doubted
+
+
+STREAM = """
+domain: {min: [0, 0, 0], max: [0.44, 0.44, 0.44], periodic: [x, y, z]}
+gravity: [0, 0, 0]
+materials: {glass: {density: 2500}}
+friction: {default: 0.3}
+bodies:
+  - {material: glass, count: 64, radius: 0.05, velocity: [8, -5, 3], velocity_jitter: 1,
+     placement: {jittered_grid: {min: [0, 0, 0], max: [0.44, 0.44, 0.44], jitter: 1}}}
+time: {step: 2e-3, end: 0.1}
+contact: {tolerance: 1e-3, complementarity: 1e-2}
+output: {interval: 1e-2}
+"""
+
+
+@pytest.mark.mpi(ranks=[1, 3])
+def test_written_positions_lie_in_the_box(parallel, shared_path):
+    simulate(parallel, STREAM, shared_path)
+    parallel.barrier()
+    for frame in range(10):
+        position = read_frame(shared_path / "run.h5", frame).columns["position"]
+        assert position.shape == (64, 3)
+        assert np.all((position >= 0.0) & (position < 0.44))
