@@ -39,7 +39,16 @@ class Parallel:
         self.rank: int = self.communicator.Get_rank()
         self.size: int = self.communicator.Get_size()
         self.bytes_sent = 0
+        self.messages_sent = 0
         self._round = 0
+
+    def count_sent(self, size: int, messages: int = 1) -> None:
+        """Add messages of `size` bytes together to what this rank has sent to other ranks.
+
+        Reductions and broadcasts are left out: what they send is MPI's choice.
+        """
+        self.bytes_sent += size
+        self.messages_sent += messages
 
     def free(self) -> None:
         """Collective. Give the communicator back to MPI; nothing else works after that."""
@@ -143,7 +152,7 @@ class Parallel:
     def _send_block(self, array: NDArray) -> None:
         for chunk in _chunks(_as_bytes(array)):
             self.communicator.Send(chunk, dest=0, tag=_BLOCK_TAG)
-        self.bytes_sent += array.nbytes
+            self.count_sent(chunk.nbytes)
 
     def _receive_block(self, source: int, shape: tuple[int, ...], dtype: np.dtype) -> NDArray:
         block = np.empty(shape, dtype=dtype)
@@ -180,7 +189,8 @@ class Parallel:
             for destination, message in messages.items()
             for chunk in _chunks(memoryview(message)) or [b""]
         ]
-        self.bytes_sent += sum(len(message) for message in messages.values())
+        for message in messages.values():
+            self.count_sent(len(message), max(1, -(-len(message) // _CHUNK)))
         status = MPI.Status()
         barrier = None
         while True:
@@ -396,7 +406,7 @@ class Halo:
                 values[self._own_ghosts] = buffer
                 continue
             requests.append(communicator.Isend(buffer, dest=destination, tag=_HALO_TAG))
-            self.parallel.bytes_sent += buffer.nbytes
+            self.parallel.count_sent(buffer.nbytes)
         MPI.Request.Waitall(requests)
 
     def reverse_add(self, values: NDArray) -> None:
@@ -418,7 +428,7 @@ class Halo:
             if source == self.parallel.rank:
                 continue
             requests.append(communicator.Isend(values[rows], dest=source, tag=_HALO_TAG))
-            self.parallel.bytes_sent += values[rows].nbytes
+            self.parallel.count_sent(values[rows].nbytes)
         MPI.Request.Waitall(requests)
         for (destination, index), runs, buffer in zip(
             self._send, self._runs, incoming, strict=True

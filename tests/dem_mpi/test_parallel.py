@@ -151,10 +151,17 @@ def test_groups_of_the_same_ranks_do_not_take_each_others_messages(parallel):
 
 
 @ranks_1_2_3_8
-def test_bytes_to_other_ranks_are_counted(parallel):
-    before = parallel.bytes_sent
+def test_messages_to_other_ranks_are_counted_with_their_bytes(parallel):
+    before = np.array([parallel.bytes_sent, parallel.messages_sent])
     parallel.exchange(dict.fromkeys(range(parallel.size), b"12345"))
-    assert parallel.bytes_sent - before == 5 * (parallel.size - 1)
+    halo = Halo.build(parallel, 2, {r: np.array([1]) for r in range(parallel.size)})
+    build = 8 * (parallel.size - 1)  # one number a receiver
+    values = np.zeros((2 + parallel.size, 3))
+    halo.forward(values)
+    halo.reverse_add(values)
+    sent = np.array([parallel.bytes_sent, parallel.messages_sent]) - before
+    row = 3 * 8
+    assert sent.tolist() == [(5 + 2 * row) * (parallel.size - 1) + build, 4 * (parallel.size - 1)]
 
 
 # ---- blocks --------------------------------------------------------------------------------
