@@ -14,6 +14,7 @@ import numpy as np
 from dem_mpi import __version__, checkpoint
 from dem_mpi.bodies import FIELDS, Bodies
 from dem_mpi.errors import DemError, InputError, StoppedError
+from dem_mpi.estimate import checkpoint_bytes
 from dem_mpi.h5files import OutputLock, require_space
 from dem_mpi.metrics import PHASES, MetricsLog, Progress, closing_table, resident_memory
 from dem_mpi.output import Field, Series, Trajectory, describe, frame_bytes
@@ -27,6 +28,7 @@ from dem_mpi.state import State, restore, save
 from dem_mpi.walls import wall_faces
 
 _PATIENCE = 5.0  # seconds that ranks wait for each other when one reports an error
+_MOST_CONTACTS = 4  # a body, in a bed of spheres that needs much space for its checkpoints
 
 
 @dataclass(frozen=True)
@@ -186,7 +188,7 @@ class Run:
         # One more than is kept: the oldest goes only when the newest is in place.
         saved = steps // self._scenario.checkpoint_every + 1
         kept = min(self._scenario.checkpoint.keep + 1, saved)
-        needed += kept * checkpoint_bytes(self._bodies)
+        needed += kept * checkpoint_bytes(self._bodies, _MOST_CONTACTS * self._bodies)
         error = None
         if self._parallel.rank == 0:
             try:
@@ -377,18 +379,6 @@ def wall_series(scenario: Scenario) -> tuple[Series, ...]:
     if not faces:
         return ()
     return (Series("walls/force", (faces, 3), "N"), Series("walls/torque", (faces, 3), "N m"))
-
-
-def checkpoint_bytes(bodies: int) -> int:
-    """Return about how many bytes [B] a checkpoint of so many bodies takes."""
-    row = sum(_row_bytes(name) for name in FIELDS) + 8 + 32
-    contacts = 4 * bodies
-    return bodies * row + contacts * 32
-
-
-def _row_bytes(name: str) -> int:
-    field = FIELDS[name]
-    return int(np.dtype(field.dtype).itemsize * np.prod(field.row_shape, dtype=np.int64))
 
 
 def _code(dtype: Any) -> str:

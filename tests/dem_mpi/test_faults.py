@@ -21,11 +21,12 @@ from mpi4py import MPI
 from dem_mpi import checkpoint
 from dem_mpi.bodies import Bodies
 from dem_mpi.errors import DataError, InputError, OutputError
+from dem_mpi.estimate import checkpoint_bytes
 from dem_mpi.h5files import OutputLock
 from dem_mpi.output import describe, frame_bytes
 from dem_mpi.parallel import Parallel
 from dem_mpi.placement import place
-from dem_mpi.runner import checkpoint_bytes, trajectory_fields
+from dem_mpi.runner import trajectory_fields
 from dem_mpi.scenario import parse_scenario
 from dem_mpi.seal import write_seal
 from dem_mpi.simulation import Simulation, SolverFailureError, start
@@ -639,7 +640,9 @@ def test_sizes_and_offsets_of_files_pass_32_bits(two_checkpoints):
     scenario = parse_scenario(PILE, "scene.yaml").scenario
     fields = trajectory_fields(scenario)
     assert frame_bytes(fields, 2**40) == 2**40 * frame_bytes(fields, 1)
-    assert checkpoint_bytes(2**40) == 2**40 * checkpoint_bytes(1)
+    structure = checkpoint_bytes(0, 0)
+    row = checkpoint_bytes(1, 4) - structure
+    assert checkpoint_bytes(2**40, 4 * 2**40) == structure + 2**40 * row
     with h5py.File(two_checkpoints / "whole" / "run.h5") as file:
         for name in ("frames/offset", "frames/count", "frames/step", "gid",
                      "VTKHDF/Steps/PointOffsets", "VTKHDF/Vertices/Connectivity"):  # fmt: skip
