@@ -96,7 +96,7 @@ def run_command(
 
     from dem_mpi.parallel import Parallel
     from dem_mpi.runner import RunOptions, run
-    from dem_mpi.warmup import set_threads, warm_up
+    from dem_mpi.warmup import kind_of, set_threads, warm_up
 
     parallel = Parallel()
     parallel.install_abort_hook()
@@ -105,7 +105,8 @@ def run_command(
         _print(f"warning: {warning}", error=True)
     set_threads(loaded.scenario.threads)
     started = perf_counter()
-    warm_up(parallel, loaded.scenario.threads, (loaded.scenario.contact.operator,))
+    operators, kinds = (loaded.scenario.contact.operator,), (kind_of(loaded.scenario),)
+    warm_up(parallel, loaded.scenario.threads, operators, kinds)
     seconds = perf_counter() - started
     if seconds > 2.0:
         _print(f"compiled kernels in {seconds:.0f} s (first run only; kept in the numba cache)")
@@ -226,11 +227,11 @@ def warmup(
     from time import perf_counter
 
     from dem_mpi.parallel import Parallel
-    from dem_mpi.warmup import set_threads, warm_up
+    from dem_mpi.warmup import GENERAL, SPHERES, set_threads, warm_up
 
     set_threads(threads)
     started = perf_counter()
-    warm_up(Parallel(), threads, ("matrix_free", "assembled"))
+    warm_up(Parallel(), threads, ("matrix_free", "assembled"), (SPHERES, GENERAL))
     _print(f"kernels ready in {perf_counter() - started:.1f} s")
 
 

@@ -9,7 +9,13 @@ from dem_mpi.bodies import Bodies
 from dem_mpi.errors import InputError
 from dem_mpi.parallel import Parallel
 from dem_mpi.scenario import parse_scenario
+from dem_mpi.scene_bodies import SHAPES
+from dem_mpi.scene_models import Scenario, only_spheres
 from dem_mpi.simulation import Simulation, start
+
+# The kinds of scene that have kernels of their own, by the shape of the bodies that call them.
+SPHERES, GENERAL = "sphere", "spherocylinder"
+_ASPECT_RATIO = {SPHERES: "null", GENERAL: "2"}
 
 # Every kernel of a run is called in two steps of this scene.
 _SCENE = """
@@ -17,8 +23,8 @@ domain: {{min: [-1, -1, -1], max: [1, 1, 1]}}
 materials: {{m: {{density: 1000}}}}
 friction: {{default: 0.3}}
 bodies:
-  - {{material: m, count: 4, radius: 0.1,
-      placement: {{jittered_grid: {{min: [0, 0, 0], max: [0.4, 0.4, 0.2]}}}}}}
+  - {{shape: {shape}, aspect_ratio: {aspect_ratio}, material: m, count: 4, radius: 0.1,
+      placement: {{jittered_grid: {{min: [-0.8, -0.8, 0], max: [0.4, 0.4, 0.4]}}}}}}
   - {{material: m, count: 1, radius: 0.1,
       placement: {{insertion: {{min: [0.5, 0.5, 0], max: [0.8, 0.8, 0.3], rate: 1}}}}}}
 walls:
@@ -42,9 +48,15 @@ def set_threads(threads: int) -> None:
 
 
 def warm_up(
-    parallel: Parallel, threads: int, operators: tuple[str, ...] = ("matrix_free",)
+    parallel: Parallel,
+    threads: int,
+    operators: tuple[str, ...] = ("matrix_free",),
+    kinds: tuple[str, ...] = (SPHERES,),
 ) -> None:
-    """Collective. Compile what these operators use on rank 0, then load it on the others."""
+    """Collective. Compile what these operators and kinds of scene use on rank 0, then load it.
+
+    kinds : SPHERES, GENERAL or both; a scene with any body that is not a sphere is GENERAL.
+    """
     if "assembled" in operators:
         # PETSc starts on all ranks together: one that came alone would wait for the others.
         import petsc4py.PETSc  # noqa: F401
@@ -52,23 +64,33 @@ def warm_up(
     for turn in (True, False):
         if (parallel.rank == 0) == turn:
             try:
-                _exercise(threads, operators)
+                for kind in kinds:
+                    _exercise(threads, operators, kind)
             except Exception as caught:
                 error = caught
         parallel.raise_together(error)
 
 
-def _exercise(threads: int, operators: tuple[str, ...]) -> None:
+def kind_of(scenario: Scenario) -> str:
+    """The kind of a scene: SPHERES or GENERAL."""
+    return SPHERES if only_spheres(scenario) else GENERAL
+
+
+def _exercise(threads: int, operators: tuple[str, ...], kind: str) -> None:
     """Run two steps of a scene of four bodies on this rank alone."""
     alone = Parallel.alone()
     for operator in operators:
-        text = _SCENE.format(threads=threads, operator=operator)
+        text = _SCENE.format(
+            threads=threads, operator=operator, shape=kind, aspect_ratio=_ASPECT_RATIO[kind]
+        )
         scenario = parse_scenario(text, "warm-up").scenario
         position = np.array([[0.0, 0, 0.1], [0.2, 0, 0.1], [0, 0.2, 0.1], [0.2, 0.2, 0.1]])
         arrays = {
             "gid": np.arange(4),
             "material": np.zeros(4, np.int32),
             "radius": np.full(4, 0.1),
+            "shape": np.full(4, SHAPES.index(kind), np.int8),
+            "half_length": np.full(4, 0.1 if kind == GENERAL else 0.0),
             "position": position,
         }
         state = start(alone, Bodies.from_arrays(arrays, np.array([1000.0])))
