@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from petsc4py import PETSc
 
 from dem_mpi.bodies import Bodies
-from dem_mpi.contacts import ContactSet
+from dem_mpi.contacts import ContactSet, Reference, find_neighbours
 from dem_mpi.errors import DemError
-from dem_mpi.operators import Assembled, MatrixFree
+from dem_mpi.integrator import symmetry_axes
+from dem_mpi.narrow_phase import find_general_contacts
+from dem_mpi.operators import Assembled, MatrixFree, world_inverse_inertia
 from dem_mpi.parallel import Parallel
+from dem_mpi.shapes import SPHERE
 
 from contact_twins import (
     all_contacts,
@@ -23,6 +28,7 @@ from contact_twins import (
     dense_operator,
     detect,
     detection,
+    distribute,
     gathered,
     measure,
     no_walls,
@@ -253,6 +259,156 @@ def test_tangential_row_turns_both_bodies_the_same_way(parallel):
         expected = -length * np.cross(n, t1) * case.masses[1][k]
         assert np.allclose(u[k, 3:], expected, rtol=1e-14, atol=0.0)
     assert np.dot(u[a, :3], t1) < 0.0 < np.dot(u[b, :3], t1)
+    case.assembled.destroy()
+
+
+# ---- bodies that are not spheres -----------------------------------------------------------
+
+
+def heap(count: int = 40) -> Bodies:
+    """Rods, spheroids and spheres in all directions, overlapping and apart, of all sizes."""
+    rng = np.random.default_rng(21)
+    radius = 0.12 * 4.0 ** -rng.random(count)
+    shape = np.arange(count) % 3
+    stretch = rng.uniform(0.3, 3.0, count)
+    directions = rng.normal(size=(count, 4))
+    arrays = {
+        "gid": 2**40 + rng.permutation(count),
+        "material": rng.integers(0, 2, count),
+        "shape": shape,
+        "radius": radius,
+        "half_length": np.where(shape == SPHERE, 0.0, stretch * radius),
+        "position": rng.random((count, 3)),
+        "orientation": directions / np.linalg.norm(directions, axis=1, keepdims=True),
+        "velocity": np.zeros((count, 3)),
+        "angular_velocity": np.zeros((count, 3)),
+    }
+    return Bodies.from_arrays(arrays, np.array([1000.0, 2500.0]))
+
+
+class GeneralCase:
+    """As `Case`, for a heap: every contact's rows of D stand in `table`, known to all ranks.
+
+    A row of the table is (a, other, occurrence, normal, arm_a, arm_b): two bodies may touch twice.
+    """
+
+    def __init__(self, parallel: Parallel, bodies: Bodies, frictional: bool, walls: bool = True):
+        self.frictional = frictional
+        self.all_bodies = bodies.take(np.argsort(bodies.gid))
+        self.columns = 3 if frictional else 1
+        self.walls = room(0.0, 1.0) if walls else no_walls()
+        options = replace(OPTIONS, general=True)
+        partition, self.owned = distribute(parallel, bodies)
+        reference = Reference.of(parallel, self.owned, self.owned.velocity, options, STEP)
+        self.neighbours = n = find_neighbours(parallel, partition, self.owned, reference, options)
+        rows = [n.extend(x) for x in (self.owned.position, symmetry_axes(self.owned))]
+        still = np.zeros_like(rows[0])
+        inertia = world_inverse_inertia(rows[1], n.inverse_inertia)
+        self.masses = (n.inverse_mass, inertia, n.halo)
+        self.contacts = c = find_general_contacts(n, *rows, still, still, self.walls, options, STEP)
+        self.matrix_free = MatrixFree(c, *self.masses, frictional)
+        self.assembled = Assembled(c, *self.masses, frictional, parallel)
+        first = np.flatnonzero(np.diff(c.a, prepend=-1) | np.diff(c.other, prepend=-99))
+        again = np.arange(c.count) - np.repeat(first, np.diff(np.append(first, c.count)))
+        mine = np.column_stack((n.gid[c.a], c.other, again, c.normal, c.arm))
+        every = gathered(parallel, mine)
+        order = np.lexsort(every[:, 2::-1].T)
+        self.table = every[order]
+        place = {tuple(row): i for i, row in enumerate(self.table[:, :3])}
+        self.rows = np.array([place[tuple(row)] for row in mine[:, :3]], dtype=int)
+        self.impulse = np.random.default_rng(22).normal(size=(len(every), self.columns))
+
+    @property
+    def mine(self) -> np.ndarray:
+        return np.ascontiguousarray(self.impulse[self.rows])
+
+    def apply(self, operator: MatrixFree | Assembled) -> np.ndarray:
+        out = np.full((self.contacts.count, self.columns), np.nan)
+        operator.apply(self.mine, out)
+        return out
+
+    def dense(self) -> tuple[np.ndarray, np.ndarray]:
+        """D (6 n, columns m) and M^-1 (6 n, 6 n), from rotation matrices and the table."""
+        bodies = self.all_bodies
+        D = np.zeros((6 * len(bodies), self.columns * len(self.table)))
+        for i, row in enumerate(self.table):
+            n = row[3:6]
+            for c, t in enumerate((n, *tangents(n))[: self.columns]):
+                for gid, sign, arm in ((row[0], -1.0, row[6:9]), (row[1], 1.0, row[9:12])):
+                    if gid >= 0:
+                        k = 6 * int(np.searchsorted(bodies.gid, int(gid)))
+                        column = np.concatenate((t, np.cross(arm, t)))
+                        D[k : k + 6, self.columns * i + c] = sign * column
+        inverse = np.zeros((6 * len(bodies), 6 * len(bodies)))
+        for k in range(len(bodies)):
+            turn = Rotation.from_quat(np.roll(bodies.orientation[k], -1)).as_matrix()
+            moments = [bodies.inertia[k], bodies.inertia[k], bodies.axial_inertia[k]]
+            inverse[6 * k : 6 * k + 3, 6 * k : 6 * k + 3] = np.eye(3) / bodies.mass[k]
+            block = turn @ np.diag(1.0 / np.array(moments)) @ turn.T
+            inverse[6 * k + 3 : 6 * k + 6, 6 * k + 3 : 6 * k + 6] = block
+        return D, inverse
+
+
+@ranks_1_2_3_8
+@both_frictions
+def test_general_matrix_free_equals_assembled_equals_dense(parallel, frictional):
+    """Normal impulses turn these bodies: six freedoms with friction and without."""
+    case = GeneralCase(parallel, heap(), frictional)
+    assert np.count_nonzero(case.table[:, 2]) > 0, "no pair touches twice"
+    D, inverse = case.dense()
+    N = D.T @ inverse @ D
+    expected = (N @ case.impulse.ravel()).reshape(case.impulse.shape)
+    scale = np.max(np.abs(N)) * np.sqrt(len(N))
+    assert close(case.apply(case.matrix_free), case.apply(case.assembled), scale)
+    assert close(case.apply(case.matrix_free), expected[case.rows], scale)
+    diagonal = np.diag(N).reshape(expected.shape)[case.rows]
+    for operator in (case.matrix_free, case.assembled):
+        assert close(operator.diagonal(), diagonal, np.max(np.abs(N)))
+    u = (inverse @ D @ case.impulse.ravel()).reshape(-1, 6)
+    rows = np.searchsorted(case.all_bodies.gid, case.neighbours.gid)
+    motion = np.random.default_rng(13).normal(size=u.shape)
+    relative = (D.T @ motion.ravel()).reshape(case.impulse.shape)[case.rows]
+    for operator in (case.matrix_free, case.assembled):
+        assert close(operator.body_velocity(case.mine), u[rows], np.max(np.abs(u)))
+        out = np.full_like(relative, np.nan)
+        operator.contact_velocity(motion[rows], out)
+        assert close(out, relative, 10.0)
+    case.assembled.destroy()
+
+
+@ranks_1_2_3_8
+@pytest.mark.parametrize("name", ["matrix_free", "assembled"])
+def test_impulses_between_general_bodies_keep_angular_momentum(parallel, name):
+    """Both arms of a contact end in one point, whatever the shapes and the gap."""
+    case = GeneralCase(parallel, heap(), frictional=True, walls=False)
+    owned = case.owned
+    u = getattr(case, name).body_velocity(case.mine)[: len(owned)]
+    force, d = owned.mass[:, None] * u[:, :3], symmetry_axes(owned)
+    spin = np.sum(d * u[:, 3:], axis=1, keepdims=True) * d
+    torque = owned.inertia[:, None] * (u[:, 3:] - spin) + owned.axial_inertia[:, None] * spin
+    sums = np.concatenate((force.sum(0), (torque + np.cross(owned.position, force)).sum(0)))
+    assert np.all(np.abs(parallel.sum(sums)) <= 1e-12 * np.abs(case.impulse).max())
+    case.assembled.destroy()
+
+
+@pytest.mark.mpi(ranks=[1, 2, 3])
+@both_frictions
+def test_refill_takes_the_inertias_of_turned_bodies(parallel, frictional):
+    case = GeneralCase(parallel, heap(), frictional)
+    axis = symmetry_axes(case.owned)
+    turned = axis + 0.01 * np.sin(case.owned.gid)[:, None] * [1.0, -2.0, 3.0]
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    n = case.neighbours
+    inertia = world_inverse_inertia(n.extend(turned), n.inverse_inertia)
+    before = case.apply(case.assembled)
+    assert case.assembled.refill(case.contacts, inertia)
+    fresh = MatrixFree(case.contacts, n.inverse_mass, inertia, n.halo, frictional)
+    expected = case.apply(fresh)
+    scale = parallel.max(float(np.max(np.abs(expected), initial=0.0)))
+    assert close(case.apply(case.assembled), expected, scale)
+    assert close(case.assembled.diagonal(), fresh.diagonal(), scale)
+    change = parallel.max(float(np.max(np.abs(before - expected), initial=0.0)))
+    assert change > 1e3 * ROUNDING * scale
     case.assembled.destroy()
 
 
