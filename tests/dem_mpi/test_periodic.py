@@ -25,7 +25,7 @@ from dem_mpi.trajectory import read_frame
 
 from contact_twins import CONTACT, cloud, detect, detection, gathered, measure, table_of
 from runs import simulate
-from scenes import FLOOR, everybody, load, scene, simulation_of, state_of
+from scenes import FLOOR, everybody, load, placed, scene, simulation_of, state_of
 
 ranks_1_2_3_8 = pytest.mark.mpi(ranks=[1, 2, 3, 8])
 
@@ -405,6 +405,36 @@ def test_shifting_all_bodies_changes_no_velocity(parallel, mu):
         # Three solves to 1e-9 m/s; velocities follow residuals with a factor of some tens.
         for one, other in zip(motion, results[0][1:], strict=True):
             assert np.max(np.abs(one - other)) < 1e-7
+
+
+@pytest.mark.mpi(ranks=[1, 2, 3], timeout=240)
+@pytest.mark.parametrize("shape", ["spherocylinder", "spheroid"])
+def test_bodies_that_are_not_spheres_meet_across_faces_as_in_the_middle(parallel, shape):
+    group = {
+        "material": "m", "shape": shape, "aspect_ratio": 1.5, "axis": "random", "count": 27,
+        "radius": 0.05, "velocity_jitter": 1.0, "angular_velocity": [3.0, 0, 2.0],
+        "placement": {"jittered_grid": {"min": [0, 0, 0], "max": [0.46] * 3}},
+    }  # fmt: skip
+    scenario = scene(
+        step=2e-3, mu=0.3, gravity=(0, 0, 0), domain=cube(0.46), bodies=[group],
+        contact={"tolerance": 1e-9, "complementarity": 1e-10, "max_iterations": 20000},
+    )  # fmt: skip
+    results = []
+    for shift in (0.0, 0.46 / 3.0):
+        state = placed(parallel, scenario)
+        state.bodies.position += shift
+        simulation = Simulation(parallel, scenario, state)
+        first = everybody(parallel, state)
+        contacts = sum(simulation.step().contacts for _ in range(25))
+        last = everybody(parallel, simulation.state)
+        scale = first.mass @ np.linalg.norm(first.velocity, axis=1)
+        change = last.mass @ last.velocity - first.mass @ first.velocity
+        # 25 steps, in each of which a body adds up some ten impulses of rounding 1e-16.
+        assert np.max(np.abs(change)) <= 25 * 10 * 1e-16 * scale
+        results.append((contacts, last.velocity))
+    assert results[0][0] == results[1][0] > 20
+    # 25 solves to 1e-9 m/s; velocities follow residuals with a factor of some tens.
+    assert np.max(np.abs(results[0][1] - results[1][1])) < 1e-6
 
 
 @ranks_1_2_3_8
