@@ -14,8 +14,8 @@ A wall is (kind, g) with a row g of twelve numbers:
     RECTANGLE  centre g[0:3], unit normal g[3:6], orthogonal half edges g[6:9] and g[9:12]; a plate
                of no thickness that is touched from both sides
     FRUSTUM    base centre g[0:3], unit axis g[3:6], length g[6], radii g[7] at the base and g[8]
-               at the other end, side g[9]: +1 bodies towards the axis (on a flat ring, length 0:
-               towards +axis), -1 on the other side
+               at the other end, side g[9]: +1 bodies towards the axis (on a flat ring, length 0
+               and g[7] < g[8]: towards +axis), -1 on the other side
 
 A contact is a row (n, gap, point): unit normal n from a to b (from the body into the wall), gap
 negative where they overlap, and the point in the middle of the gap relative to the centre of a.
@@ -49,6 +49,7 @@ from dem_mpi._kernels_vectors import (
 )
 from dem_mpi._kernels_wall_points import (
     behind,
+    on_far_side,
     on_frustum,
     on_rectangle,
 )
@@ -125,7 +126,7 @@ def wall_contacts(wall_kind, g, kind, x, d, r, l, limit, out):  # noqa: E741
     """Write the contacts of a body and a wall with gap <= limit; return how many (at most two).
 
     out : (2, 7) float64, rows (n from the body into the wall, gap [m], point - x [m]), two of
-    them ordered along the axis of the body.
+    them ordered along the axis of the body; of a sphere the nearer first.
     """
     x, d = vec(x), vec(d)
     half = l if kind == SPHEROCYLINDER else 0.0
@@ -148,7 +149,13 @@ def wall_contacts(wall_kind, g, kind, x, d, r, l, limit, out):  # noqa: E741
         return 0
     if half == 0.0 and kind != SPHEROID:
         rod_contact(n, distance - r, 0.0, d, r, out, 0)
-        return 1
+        if wall_kind == RECTANGLE:
+            return 1
+        distance, n = on_far_side(x, g)
+        if distance < -r or not distance - r <= limit:
+            return 1
+        rod_contact(n, distance - r, 0.0, d, r, out, 1)
+        return 2
     hidden = behind(clamped, height, smallest_size(kind, r, l))
     if wall_kind == RECTANGLE:
         if kind == SPHEROID:

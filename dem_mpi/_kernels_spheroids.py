@@ -486,7 +486,7 @@ def _spheroid_face(X, d, a, c, g, k, e1, e2, limit, peak, found, count):
     L, slant, us, ur, cos, sin = frustum_frame(g)
     side, r0 = g[9], g[7]
     if L == 0.0:
-        m = scaled(side, k)
+        m = scaled(side * sin, k)
         gap, point = spheroid_plane(X, d, a, c, m)
         surface = along(point, 0.5 * gap, m)
         f = ur * (meridian(along(X, 1.0, surface), k)[1] - r0)

@@ -46,26 +46,20 @@ def frustum_frame(g):
     """Return (length, slant, us, ur, cos, sin): the meridian segment of a frustum.
 
     (us, ur) is its unit direction from the base and (-sin, cos) its normal away from the axis
-    (on a flat ring: along -axis), both as (s, rho).
+    (on a flat ring that widens: along -axis), both as (s, rho).
     """
     L, rise = g[6], g[8] - g[7]
     slant = np.sqrt(L * L + rise * rise)
-    if L == 0.0:
-        return L, slant, 0.0, (1.0 if rise >= 0.0 else -1.0), 0.0, 1.0
+    if slant == 0.0:  # a ring without width is its rim
+        return L, slant, 0.0, 1.0, 0.0, 1.0
     return L, slant, L / slant, rise / slant, L / slant, rise / slant
 
 
 @jit
-def on_frustum(P, g):
-    """Return (distance, n, clamped, height) from a point P to a frustum, n towards it.
-
-    Foot within the surface: the distance is signed, positive on the bodies' side, and n is the
-    normal of that side even behind the surface. Foot on a rim (`clamped`): unsigned. `height` is
-    the signed distance from the surface continued beyond its rims.
-    """
+def _on_meridian(s, rho, radial, g):
+    """`on_frustum` in the meridian half plane along `radial`; on the opposite one rho < 0."""
     k, side = vec(g[3:6]), g[9]
     _, slant, us, ur, cos, sin = frustum_frame(g)
-    s, rho, radial = meridian(sub(P, vec(g[0:3])), k)
     away = along(scaled(side * cos, radial), -side * sin, k)
     height = -side * (cos * (rho - g[7]) - sin * s)
     f = us * s + ur * (rho - g[7])
@@ -77,6 +71,34 @@ def on_frustum(P, g):
     if distance == 0.0:
         return 0.0, away, True, height
     return distance, along(scaled(vr / distance, radial), vs / distance, k), True, height
+
+
+@jit
+def on_frustum(P, g):
+    """Return (distance, n, clamped, height) from a point P to a frustum, n towards it.
+
+    Foot within the surface: the distance is signed, positive on the bodies' side, and n is the
+    normal of that side even behind the surface. Foot on a rim (`clamped`): unsigned. `height` is
+    the signed distance from the surface continued beyond its rims.
+    """
+    s, rho, radial = meridian(sub(P, vec(g[0:3])), vec(g[3:6]))
+    return _on_meridian(s, rho, radial, g)
+
+
+@jit
+def on_far_side(P, g):
+    """Return (distance, n) on the meridian opposite to the nearest; inf if P is not held there.
+
+    It is where a sphere in a snug tube, a tapering cone or a hole has its second contact: inside a
+    surface, or on the rim of a hole.
+    """
+    s, rho, radial = meridian(sub(P, vec(g[0:3])), vec(g[3:6]))
+    distance, n, clamped, _ = _on_meridian(s, -rho, neg(radial), g)
+    _, _, us, ur, _, _ = frustum_frame(g)
+    rim = g[7] if us * s - ur * (rho + g[7]) < 0.0 else g[8]
+    if (clamped and rim == 0.0) or (not clamped and g[9] < 0.0):
+        return np.inf, n
+    return distance, n
 
 
 @jit

@@ -27,6 +27,7 @@ from dem_mpi._kernels_shapes import (
     wall_contacts,
 )
 from dem_mpi._kernels_spheroids import newton_direction, spheroid_foot, spheroid_segment
+from dem_mpi._kernels_walls import sphere_wall
 
 import shape_twins as twins
 
@@ -508,7 +509,8 @@ WALLS = {
     "funnel outside": (FRUSTUM, frustum(ORIGIN, Z, 3.0, 0.5, 2.0, -1.0)),
     "tip": (FRUSTUM, frustum(ORIGIN, Z, 2.0, 1.0, 0.0, -1.0)),
     "ring": (FRUSTUM, frustum(ORIGIN, Z, 0.0, 0.5, 2.0, 1.0)),
-    "ring below": (FRUSTUM, frustum(ORIGIN, Z, 0.0, 2.0, 0.5, -1.0)),
+    "ring below": (FRUSTUM, frustum(ORIGIN, Z, 0.0, 0.5, 2.0, -1.0)),
+    "ring inwards": (FRUSTUM, frustum(ORIGIN, Z, 0.0, 2.0, 0.5, 1.0)),
 }
 
 
@@ -618,6 +620,24 @@ def test_rod_without_length_is_a_sphere_at_every_wall(wall):
     for sphere in bodies_about_a_wall(rng, "sphere", 50):
         rod = Body(SPHEROCYLINDER, sphere.x, sphere.d, sphere.r, 0.0)
         assert np.array_equal(at_wall(kind, g, sphere, 0.5), at_wall(kind, g, rod, 0.5))
+
+
+@pytest.mark.parametrize("wall", WALLS)
+def test_sphere_touches_a_wall_as_in_scenes_of_spheres(wall):
+    """The kernels of spheres alone know the same places, those on the far side included."""
+    rng = np.random.default_rng(18)
+    kind, g = WALLS[wall]
+    face = np.zeros((1, 22))
+    face[0, :12], face[0, 21] = g, kind
+    for sphere in bodies_about_a_wall(rng, "sphere", 100):
+        sphere.r = rng.choice([0.3, 1.2])
+        places = np.array(sphere_wall(face, 0, *sphere.x, sphere.r))
+        rows = at_wall(kind, g, sphere, 0.5)
+        if places[0, 0] <= 0.5:
+            expected = places[places[:, 0] <= 0.5]
+            np.testing.assert_allclose(rows[:, [3, 0, 1, 2]], expected, atol=EXACT)
+        else:
+            assert len(rows) == 0
 
 
 @pytest.mark.parametrize("shape", BODIES)

@@ -204,7 +204,7 @@ def frustum_distance(y: NDArray, g: NDArray) -> NDArray:
     length = np.linalg.norm(along)
     along = along / length
     f = s * along[0] + (rho - g[7]) * along[1]
-    to_bodies = g[9] * (np.array([1.0, 0.0]) if g[6] == 0.0 else np.array([along[1], -along[0]]))
+    to_bodies = g[9] * np.array([along[1], -along[0]])
     height = s * to_bodies[0] + (rho - g[7]) * to_bodies[1]
     rim = np.clip(f, 0.0, length)
     clamped = np.hypot(s - rim * along[0], rho - g[7] - rim * along[1])
