@@ -52,12 +52,12 @@ def zoom(
     free = np.zeros(len(low), bool) if wrap is None else np.asarray(wrap)
     axes = [np.linspace(a, b, first) for a, b in zip(low, high, strict=True)]
     half = 4.0 * (high - low) / (first - 1)
-    best_u, best = None, np.inf
+    centre, best_u, best = 0.5 * (low + high), None, np.inf
     for _ in range(400):
         points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(low))
         values = function(points)
         at = int(np.argmin(values))
-        inside = best_u is not None and np.all(np.abs(points[at] - centre) <= 0.6 * half)  # noqa: F821
+        inside = best_u is not None and np.all(np.abs(points[at] - centre) <= 0.6 * half)
         if values[at] < best:
             best_u, best = points[at], float(values[at])
         else:
