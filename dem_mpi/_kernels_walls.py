@@ -86,16 +86,16 @@ def may_touch(f, k, x, y, z, r, limit):
         return abs(height) <= reach
     if kind != FRUSTUM or height < -reach or height > f[k, 6] + reach:
         return False
-    # For a frustum the height is that along its axis.
+    # For a frustum the height is that along its axis, and the mantle is beyond the line through it.
     dx, dy, dz = x - f[k, 0], y - f[k, 1], z - f[k, 2]
-    square = dx * dx + dy * dy + dz * dz - height * height
-    widest = max(f[k, 7], f[k, 8]) + reach
-    narrowest = min(f[k, 7], f[k, 8]) - reach
-    # The square of rho is a difference of two: leave its rounding to the exact test.
-    slack = 1e-9 * (widest * widest + height * height)
-    return square <= widest * widest + slack and not (
-        narrowest > 0.0 and square < narrowest * narrowest - slack
-    )
+    rho = np.sqrt(max(0.0, dx * dx + dy * dy + dz * dz - height * height))
+    base, rise, widest = f[k, 7], f[k, 8] - f[k, 7], max(f[k, 7], f[k, 8])
+    # A difference of squares knows rho to the root of their rounding: the exact test decides.
+    reach += 1e-7 * (widest + abs(height))
+    if rho > widest + reach:
+        return False
+    slant = np.sqrt(f[k, 6] * f[k, 6] + rise * rise)
+    return abs(f[k, 6] * (base - rho) + rise * height) <= reach * slant
 
 
 # ---- places on a wall: (gap, n_x, n_y, n_z) ------------------------------------------------
