@@ -127,3 +127,47 @@ def accept_in_order(
                 chosen[b] = k
                 break
         held[queue[b]] = chosen[b] < 0
+
+
+@jit
+def visit_cells(
+    visitor, reach, coordinate, order, key, purpose, gap, attempts,
+    low, cell, region_low, region_high, first, strides, used, head, following, spheres, count,
+    placed,
+):  # fmt: skip
+    """Let visitors try random places in their cells, one after another in `order`.
+
+    visitor (v, 3) is scratch for the place found, reach (v,) [m], coordinate (v, 3) of the cell in
+    the whole grid. Attempt t of a cell has the counter (number of the cell, t); used (cells,)
+    counts a cell's attempts. Places are inside the cell and keep `reach` from the faces of the
+    region. Who finds one is linked as sphere `count` and following; placed (v,) is marked. Returns
+    the new count.
+    """
+    k0, k1, zero = np.uint64(key[0]), np.uint64(key[1]), np.uint64(0)
+    inner = np.empty(3)
+    width = np.empty(3)
+    for v in order:
+        i, j, k = coordinate[v]
+        c = (i - first[0] + 1) * strides[0] + (j - first[1] + 1) * strides[1] + k - first[2] + 1
+        number = (np.uint64(i) << np.uint64(42)) | (np.uint64(j) << np.uint64(21)) | np.uint64(k)
+        for axis in range(3):
+            start = low[axis] + coordinate[v, axis] * cell[axis]
+            inner[axis] = max(start, region_low[axis] + reach[v])
+            width[axis] = max(min(start + cell[axis], region_high[axis] - reach[v]), inner[axis])
+            width[axis] -= inner[axis]
+        for _ in range(attempts):
+            words = philox(number, np.uint64(used[c]), zero, np.uint64(purpose), k0, k1)
+            used[c] += 1
+            x = inner[0] + width[0] * np.float64(words[0] >> _SHIFT) * _UNIT
+            y = inner[1] + width[1] * np.float64(words[1] >> _SHIFT) * _UNIT
+            z = inner[2] + width[2] * np.float64(words[2] >> _SHIFT) * _UNIT
+            if is_free(x, y, z, reach[v], gap, c, strides[0], strides[1], head, following, spheres):
+                visitor[v, 0], visitor[v, 1], visitor[v, 2] = x, y, z
+                spheres[count, 0], spheres[count, 1], spheres[count, 2] = x, y, z
+                spheres[count, 3] = reach[v]
+                following[count] = head[c]
+                head[c] = count
+                count += 1
+                placed[v] = True
+                break
+    return count

@@ -18,8 +18,10 @@ from dem_mpi import sizes
 from dem_mpi.body_file import BodyFile
 from dem_mpi.counter_random import WORDS_PER_BLOCK, Purpose, key_of, uniform
 from dem_mpi.errors import DemError, InputError
+from dem_mpi.random_placement import place_at_random
 from dem_mpi.scene_bodies import SHAPES, BodyGroup, JitteredGrid
 from dem_mpi.scene_models import Scenario
+from dem_mpi.shapes import bounding_radius
 from dem_mpi.sizes import largest_reach
 
 if TYPE_CHECKING:  # a scene is checked without starting MPI
@@ -137,13 +139,40 @@ def place(parallel: Parallel, scenario: Scenario) -> dict[str, np.ndarray]:
     any number of ranks. Raises DataError for a damaged file of bodies, InputError where a random
     placement finds no room.
     """
+    parts: list[dict[str, np.ndarray]] = []
     error = None
     try:
-        parts = [place_share(scenario, parallel.rank, parallel.size)]
+        parts.append(place_share(scenario, parallel.rank, parallel.size))
     except DemError as caught:
         error = caught
     parallel.raise_together(error)
-    return parts[0]
+    for number, group in enumerate(scenario.bodies):
+        if group.placement.random is not None:
+            parts.append(_place_at_random(parallel, scenario, number, parts))
+    return _joined(parts)
+
+
+def _place_at_random(
+    parallel: Parallel,
+    scenario: Scenario,
+    number: int,
+    standing: Sequence[Mapping[str, np.ndarray]],
+) -> dict[str, np.ndarray]:
+    """Collective. The bodies of a group that find a place among those `standing` on all ranks."""
+    group = scenario.bodies[number]
+    assert group.count is not None
+    index = np.arange(*share(group.count, parallel.rank, parallel.size), dtype=np.int64)
+    obstacles = [
+        np.column_stack(
+            (part["position"], bounding_radius(part["shape"], part["radius"], part["half_length"]))
+        )
+        for part in standing
+    ]
+    placed = place_at_random(
+        parallel, group, scenario.seed, number, index,
+        reaches(group, scenario.seed, number, index), np.concatenate(obstacles),
+    )  # fmt: skip
+    return bodies_of(scenario, number, placed.index, placed.position)
 
 
 def place_share(scenario: Scenario, rank: int, size: int) -> dict[str, np.ndarray]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 
 from dem_mpi.placement import grid, grid_capacity
+from dem_mpi.random_placement import fraction_beside, largest_fraction, volume_fraction
 from dem_mpi.scene_base import Region
 from dem_mpi.scene_bodies import BodyGroup, Insertion, RandomPlacement, removal_name
 from dem_mpi.scene_models import Scenario
@@ -23,6 +25,8 @@ def room_violations(scenario: Scenario) -> Iterator[Rule]:
             region = getattr(group.placement, key)
             if region is not None:
                 yield from _width(("bodies", index, "placement", key), region, group)
+        if group.placement.random is not None:
+            yield from _fraction(index, group, scenario.bodies[:index])
     names: dict[str, int] = {}
     for index, region in enumerate(scenario.removal):
         first = names.setdefault(removal_name(region, index), index)
@@ -50,6 +54,22 @@ def _width(here: KeyPath, region: Region, group: BodyGroup) -> Iterator[Rule]:
     thinnest = min(b - a for a, b in zip(region.min, region.max, strict=True))
     if thinnest < diameter * (1 - 1e-12):
         yield here, f"{_size(region)} m is too thin for bodies of diameter {diameter:g} m"
+
+
+def _fraction(index: int, group: BodyGroup, before: Sequence[BodyGroup]) -> Iterator[Rule]:
+    """Whether random places can be found for so many bodies."""
+    fraction, largest = volume_fraction(group), largest_fraction(group)
+    beside = fraction_beside(group, before)
+    if fraction + beside > largest:
+        assert group.count is not None
+        fit = math.floor(group.count * max(0.0, largest - beside) / fraction)
+        others = f" beside {beside:.3g} of earlier groups" if beside else ""
+        yield (
+            ("bodies", index, "count"),
+            f"takes {fraction:.3g} of the volume of placement.random{others}, gaps included; "
+            f"random places are found up to {largest:.3g} there, for {fit} bodies. Lower count, "
+            f"enlarge the region or use jittered_grid",
+        )
 
 
 def _grid_room(index: int, group: BodyGroup) -> Iterator[Rule]:
