@@ -72,6 +72,8 @@ def mpirun(ranks: int, command: list[str]) -> None:
         "OMPI_MCA_hwloc_base_binding_policy": "none",
         "OMPI_MCA_rmaps_base_oversubscribe": "1",
     }
+    if ranks > (os.cpu_count() or 1):
+        environment |= {"OMPI_MCA_mpi_yield_when_idle": "1"}
     if os.geteuid() == 0:
         environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     call = ["mpirun", "--quiet", "-n", str(ranks), sys.executable, *command]

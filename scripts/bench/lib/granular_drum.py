@@ -1,0 +1,113 @@
+"""A rotating drum in steady state: slope of the bed, torque on the mantle, power."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lib.granular_runs import Run, run
+from records import Record
+
+RADIUS = 0.1  # [m] of the drum
+SPHERE = 0.004  # [m]
+DENSITY = 2500.0  # [kg/m^3]
+GRAVITY = 9.81  # [m/s^2]
+
+
+@dataclass(frozen=True)
+class Steady:
+    """Means over the steady part of a run."""
+
+    angle: float  # of the centre of mass from straight below the axis [degrees]
+    scatter: float  # standard deviation of that angle from frame to frame [degrees]
+    torque: float  # on the mantle about its axis [N m]
+    torque_ratio: float  # torque over weight times lateral offset of the centre of mass
+    power: float  # work of the mantle on the bed per time [W]
+    power_ratio: float  # dissipation over work
+
+
+def steady(done: Run, start: float) -> Steady:
+    """Measure from `start` [s] to the end of a run of the drum, which turns about y."""
+    time, work, balance = done.metrics("time", "wall_work", "energy_balance")
+    torque = done.reaction("mantle")[:, 4]
+    window = time > start
+    frames = [(t, frame["position"]) for t, frame in done.frames("position") if t > start]
+    centre = np.array([position.mean(axis=0) for _, position in frames])
+    weight = DENSITY * 4.0 / 3.0 * np.pi * SPHERE**3 * GRAVITY * len(frames[0][1])
+    angle = np.degrees(np.arctan2(-centre[:, 0], -centre[:, 2]))
+    done_work = float(work[window].sum())
+    mean_torque = float(torque[window].mean())
+    return Steady(
+        angle=float(angle.mean()),
+        scatter=float(angle.std()),
+        torque=mean_torque,
+        torque_ratio=mean_torque / (weight * float(centre[:, 0].mean())),
+        power=done_work / float(time[-1] - start),
+        power_ratio=(done_work - float(balance[window].sum())) / done_work,
+    )
+
+
+# ---- the study ------------------------------------------------------------------------------
+
+# Friction between the spheres, and rate of rotation [rad/s].
+CASES = ((0.2, 2.0), (0.4, 2.0), (0.8, 2.0), (0.4, 1.0), (0.4, 4.0))
+START, END = 1.5, 3.0  # [s]
+
+
+def overrides(mu: float, rate: float, count: int, end: float) -> dict[str, Any]:
+    """The settings of configs/drum.yaml; its depth goes with the number of bodies."""
+    depth = 0.05 * count / 1500.0
+    return {
+        "bodies.0.count": count,
+        "bodies.0.placement.jittered_grid.max": [0.069, depth, 0.069],
+        "walls.0.end": [0, depth, 0],
+        "walls.0.motion.rotation.rate": rate,
+        "walls.2.point": [0, depth, 0],
+        "friction.default": mu,
+        "time.end": end,
+    }
+
+
+def study(quick: bool) -> tuple[list[Record], list[dict[str, Any]]]:
+    """Run the drum at several frictions and speeds; return records, and rows for `draw`."""
+    count, end = (300, 2.0) if quick else (1000, END)
+    records, rows = [], []
+    for mu, rate in CASES[:3] if quick else CASES:
+        found = steady(run("drum", overrides(mu, rate, count, end)), START)
+        froude = rate**2 * RADIUS / GRAVITY
+        params = {"mu": mu, "rate": rate, "froude": froude, "spheres": count}
+        rows.append({"mu": mu, "froude": froude, "angle": found.angle, "scatter": found.scatter})
+        for name, value, unit, error in (
+            ("angle", found.angle, "degrees", found.scatter),
+            ("torque", found.torque, "N m", None),
+            ("torque_ratio", found.torque_ratio, "1", abs(found.torque_ratio - 1.0)),
+            ("power", found.power, "W", None),
+            ("power_ratio", found.power_ratio, "1", abs(found.power_ratio - 1.0)),
+        ):
+            records.append(Record(f"granular.drum.{name}", params, value, unit, error=error))
+    return records, rows
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Angle of repose against friction, and against the Froude number."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(8, 3.5), constrained_layout=True, sharey=True)
+    same_speed = [row for row in rows if row["froude"] == rows[0]["froude"]]
+    same_friction = sorted((row for row in rows if row["mu"] == 0.4), key=lambda row: row["froude"])
+    for axis, key, chosen, label in (
+        (axes[0], "mu", same_speed, "friction coefficient"),
+        (axes[1], "froude", same_friction, "Froude number"),
+    ):
+        angle, scatter = ([row[name] for row in chosen] for name in ("angle", "scatter"))
+        axis.errorbar([row[key] for row in chosen], angle, scatter, fmt="o-", capsize=3)
+        axis.set_xlabel(label)
+        axis.grid(True, alpha=0.25)
+    axes[0].set_ylabel("dynamic angle of repose [degrees]")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
