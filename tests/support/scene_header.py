@@ -7,7 +7,9 @@
 Quantities, of the last frame, in SI units:
     centre_of_mass_z              mass-weighted mean height [m]
     velocity_z_of_centre_of_mass  mass-weighted mean velocity along z [m/s]
+    velocity_x_of_centre_of_mass  mass-weighted mean velocity along x [m/s]
     velocity_x_of_body_0          velocity along x of the body with gid 0 [m/s]
+    radius_of_97_percent          distance from the z axis that 97.5 % of the mass keep within [m]
 """
 
 from __future__ import annotations
@@ -16,7 +18,13 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-QUANTITIES = ("centre_of_mass_z", "velocity_z_of_centre_of_mass", "velocity_x_of_body_0")
+QUANTITIES = (
+    "centre_of_mass_z",
+    "velocity_z_of_centre_of_mass",
+    "velocity_x_of_centre_of_mass",
+    "velocity_x_of_body_0",
+    "radius_of_97_percent",
+)
 
 
 @dataclass(frozen=True)

@@ -28,12 +28,21 @@ def last_frame(path: Path) -> dict[str, np.ndarray]:
 
 
 def measure(quantity: str, frame: dict[str, np.ndarray]) -> float:
-    """A header's quantity; spheres of one material, so that mass goes with radius cubed."""
+    """A header's quantity; bodies of one shape and material, so that mass goes with radius cubed."""
     if quantity == "velocity_x_of_body_0":
         return float(frame["velocity"][frame["gid"] == 0, 0][0])
     weight = frame["radius"] ** 3
-    of = {"centre_of_mass_z": "position", "velocity_z_of_centre_of_mass": "velocity"}[quantity]
-    return float(np.average(frame[of][:, 2], weights=weight))
+    if quantity == "radius_of_97_percent":
+        distance = np.hypot(*frame["position"][:, :2].T)
+        order = np.argsort(distance)
+        held = np.cumsum(weight[order]) / weight.sum()
+        return float(distance[order][np.searchsorted(held, 0.975)])
+    column, axis = {
+        "centre_of_mass_z": ("position", 2),
+        "velocity_z_of_centre_of_mass": ("velocity", 2),
+        "velocity_x_of_centre_of_mass": ("velocity", 0),
+    }[quantity]
+    return float(np.average(frame[column][:, axis], weights=weight))
 
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
