@@ -28,7 +28,7 @@ def last_frame(path: Path) -> dict[str, np.ndarray]:
 
 
 def measure(quantity: str, frame: dict[str, np.ndarray]) -> float:
-    """A header's quantity; bodies of one shape and material, so that mass goes with radius cubed."""
+    """A header's quantity; bodies of one shape and material: mass goes with radius cubed."""
     if quantity == "velocity_x_of_body_0":
         return float(frame["velocity"][frame["gid"] == 0, 0][0])
     weight = frame["radius"] ** 3
