@@ -305,8 +305,9 @@ def test_rods_fall_into_a_box_and_come_to_rest(parallel, operator: str) -> None:
 @pytest.mark.mpi(ranks=[2, 3, 8])
 def test_a_pile_moves_alike_on_any_number_of_ranks(parallel) -> None:
     """Against one rank; tolerance: 1e-16 from sums in another order, grown by collisions."""
+    falling = [{**group, "velocity": [0.0, 0.0, -2.0]} for group in MIX]
     scenario = scene(
-        step=2e-3, end=0.06, mu=0.3, bodies=MIX, walls=[BOX],
+        step=2e-3, end=0.06, mu=0.3, bodies=falling, walls=[BOX],
         contact={"tolerance": 1e-9, "complementarity": 1e-9},
     )  # fmt: skip
 
@@ -397,7 +398,7 @@ def test_contacts_of_all_shapes_equal_brute_force_on_any_number_of_ranks(paralle
     found = contact_rows(parallel, bodies)
     assert found.tobytes() == contact_rows(Parallel.alone(), bodies).tobytes()
     expected = brute_force(bodies)
-    assert len(found) > 80 and np.any(np.diff(found[:, :2], axis=0).any(axis=1) == 0)
+    assert len(found) > 60 and np.any(np.diff(found[:, :2], axis=0).any(axis=1) == 0)
     assert np.array_equal(found[:, :2], expected[:, :2])
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-14)
 
