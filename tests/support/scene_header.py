@@ -4,12 +4,15 @@
     # reduced: <key.path=value> ...                        overrides for a run of seconds
     # expect_reduced: <quantity> = <value> +- <tolerance>  of that run
 
-Quantities, of the last frame, in SI units:
+Quantities, of the last frame unless they say otherwise, in SI units:
     centre_of_mass_z              mass-weighted mean height [m]
     velocity_z_of_centre_of_mass  mass-weighted mean velocity along z [m/s]
     velocity_x_of_centre_of_mass  mass-weighted mean velocity along x [m/s]
     velocity_x_of_body_0          velocity along x of the body with gid 0 [m/s]
     radius_of_97_percent          distance from the z axis that 97.5 % of the mass keep within [m]
+    mass_flow                     mass removed in the last third of the run over that time [kg/s]
+    torque_over_weight_offset     torque along y on the wall "mantle" over weight times x of the
+                                  centre of mass, means over the second half of the run
 """
 
 from __future__ import annotations
@@ -24,6 +27,8 @@ QUANTITIES = (
     "velocity_x_of_centre_of_mass",
     "velocity_x_of_body_0",
     "radius_of_97_percent",
+    "mass_flow",
+    "torque_over_weight_offset",
 )
 
 
