@@ -145,8 +145,16 @@ class Bodies:
 
     def take(self, index: ArrayLike) -> Bodies:
         """Copy the rows `index` (k,), in that order."""
+        return self.take_from([self], index)
+
+    @classmethod
+    def take_from(cls, parts: Sequence[Bodies], index: ArrayLike) -> Bodies:
+        """Copy the rows `index` (k,) of all `parts`, one behind the other, in that order.
+
+        Apart from the result no more than one array is copied at a time.
+        """
         rows = _row_index(index)
-        return Bodies(**{name: array[rows] for name, array in self.arrays().items()})
+        return cls(**{n: _laid_end_to_end([getattr(p, n) for p in parts])[rows] for n in FIELDS})
 
     def pack(self, index: ArrayLike) -> bytes:
         """Write the rows `index` (k,) as a message that `unpack` restores bit for bit."""
@@ -209,12 +217,23 @@ class ImpulseMemory:
 
     def take(self, index: ArrayLike) -> ImpulseMemory:
         """Copy the memories of the bodies `index` (k,), in that order."""
+        return self.take_from([self], index)
+
+    @classmethod
+    def take_from(cls, parts: Sequence[ImpulseMemory], index: ArrayLike) -> ImpulseMemory:
+        """Copy the memories of the bodies `index` (k,) of all `parts`, as `Bodies.take_from`."""
         rows = _row_index(index)
-        count = np.diff(self.offsets)[rows]
+        every = _laid_end_to_end([np.diff(p.offsets) for p in parts])
+        count = every[rows]
         offsets = _offsets(count)
         # Row j of the copy, of body b, comes from row j + (old start of b - new start of b).
-        contact = np.arange(offsets[-1]) + np.repeat(self.offsets[rows] - offsets[:-1], count)
-        return ImpulseMemory(offsets, self.other[contact], self.impulse[contact])
+        contact = np.repeat(_offsets(every)[rows] - offsets[:-1], count)
+        contact += np.arange(offsets[-1])
+        return cls(
+            offsets,
+            _laid_end_to_end([p.other for p in parts])[contact],
+            _laid_end_to_end([p.impulse for p in parts])[contact],
+        )
 
     def pack(self, index: ArrayLike) -> bytes:
         """Write the memories of the bodies `index` (k,) as a message for `unpack`."""
@@ -320,6 +339,11 @@ def _as_field(name: str, value: ArrayLike, field: Field, rows: int) -> NDArray:
     if array.shape != (rows, *field.row_shape):
         raise ValueError(f"{name}: shape {array.shape}, expected {(rows, *field.row_shape)}")
     return array
+
+
+def _laid_end_to_end(arrays: Sequence[NDArray]) -> NDArray:
+    """All rows; one array alone is not copied."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
 def _offsets(count: NDArray) -> NDArray[np.int64]:

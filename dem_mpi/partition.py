@@ -177,12 +177,22 @@ def migrate(
         for rank, rows in zip(ranks, np.split(leaving, starts[1:]), strict=False)
     }
     received = [unpack_rows(message) for message in parallel.exchange(messages).values()]
-    staying = np.flatnonzero(destination == parallel.rank)
-    arrived = Bodies.concatenate([bodies.take(staying), *(b for b, _ in received)])
-    memories = ImpulseMemory.concatenate([memory.take(staying), *(m for _, m in received)])
-    _check_conservation(parallel, bodies.gid, arrived.gid)
-    order = partition.order(arrived.position, arrived.gid)
-    return arrived.take(order), memories.take(order), parallel.sum(len(leaving))
+    arrivals = [b for b, _ in received]
+    first, last = len(bodies), len(bodies) + sum(map(len, arrivals))
+    index = np.flatnonzero(destination == parallel.rank)
+    index = np.concatenate((index, np.arange(first, last)))
+    # Of a rank's bodies there is room for two copies, not for one of each stage.
+    position = np.concatenate([bodies.position, *(b.position for b in arrivals)])[index]
+    gid = np.concatenate([bodies.gid, *(b.gid for b in arrivals)])[index]
+    _check_conservation(parallel, bodies.gid, gid)
+    index = index[partition.order(position, gid)]
+    del position, gid, destination
+    memories = [memory, *(m for _, m in received)]
+    return (
+        Bodies.take_from([bodies, *arrivals], index),
+        ImpulseMemory.take_from(memories, index),
+        parallel.sum(len(leaving)),
+    )
 
 
 def _check_conservation(parallel: Parallel, before: NDArray, after: NDArray) -> None:
