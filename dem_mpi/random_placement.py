@@ -273,7 +273,9 @@ class _Work:
         colour = (cell % 3) @ np.array([9, 3, 1])
         position = np.empty((len(visitors), 3))
         placed = np.zeros(len(visitors), dtype=bool)
-        for number in range(len(_COLOURS)):
+        # Late visits are few: colours that nobody visits need no exchange.
+        visited = np.bincount(colour, minlength=len(_COLOURS))
+        for number in np.flatnonzero(self._parallel.max(visited)):
             turn = order[colour[order] == number]
             self._visit(position, reach, cell, turn, attempts, placed)
             new = turn[placed[turn]]

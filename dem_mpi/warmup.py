@@ -8,6 +8,7 @@ import numpy as np
 from dem_mpi.bodies import Bodies
 from dem_mpi.errors import InputError
 from dem_mpi.parallel import Parallel
+from dem_mpi.placement import place
 from dem_mpi.scenario import parse_scenario
 from dem_mpi.scene_bodies import SHAPES
 from dem_mpi.scene_models import Scenario, only_spheres
@@ -27,6 +28,8 @@ bodies:
       placement: {{jittered_grid: {{min: [-0.8, -0.8, 0], max: [0.4, 0.4, 0.4]}}}}}}
   - {{material: m, count: 1, radius: 0.1,
       placement: {{insertion: {{min: [0.5, 0.5, 0], max: [0.8, 0.8, 0.3], rate: 1}}}}}}
+  - {{material: m, count: 1, radius: 0.1,
+      placement: {{random: {{min: [-0.9, -0.9, 0], max: [-0.5, -0.5, 0.4]}}}}}}
 walls:
   - {{shape: plane, material: m, point: [0, 0, 0], normal: [0, 0, 1],
       motion: {{velocity: [0, 0, 0.1]}}}}
@@ -84,6 +87,7 @@ def _exercise(threads: int, operators: tuple[str, ...], kind: str) -> None:
             threads=threads, operator=operator, shape=kind, aspect_ratio=_ASPECT_RATIO[kind]
         )
         scenario = parse_scenario(text, "warm-up").scenario
+        place(alone, scenario)  # random places have kernels of their own
         position = np.array([[0.0, 0, 0.1], [0.2, 0, 0.1], [0, 0.2, 0.1], [0.2, 0.2, 0.1]])
         arrays = {
             "gid": np.arange(4),
