@@ -25,6 +25,7 @@ import numpy as np
 
 from dem_mpi.bodies import FIELDS
 from dem_mpi.scenario import Scenario, body_count, friction_table, frictional
+from dem_mpi.scene_models import only_spheres
 from dem_mpi.scene_walls import BoxWall
 from dem_mpi.shapes import sphere_volume
 from dem_mpi.sizes import largest_radius, smallest_radius
@@ -50,6 +51,8 @@ _MATRIX_ROW = 2 * 4 + 2 * 8  # row pointers likewise, and its place in two vecto
 
 _FRAME_INDEX = 400  # entries of a frame in the tables of frames, which grow 256 frames at a time
 _TRAJECTORY_STRUCTURE = 220_000  # data sets, attributes and the first 256 entries of each table
+_REACTION = 6 * 8  # force and torque on a face
+_SERIES_STRUCTURE = 8_000  # four data sets more, with their checksums
 _CHECKPOINT_STRUCTURE = 12_000
 _CHECKPOINT_CONTACT = 8 + 24  # partner and impulse
 
@@ -170,6 +173,9 @@ def trajectory_bytes(scenario: Scenario, bodies: int, frames: int) -> int:
     columns = {"position", "gid", *scenario.output.fields}
     row = sum(_row_bytes(name) for name in columns)
     index = _TRAJECTORY_STRUCTURE + max(0, frames - 256) * _FRAME_INDEX
+    faces = len(wall_faces(scenario).name)
+    if faces:
+        index += _SERIES_STRUCTURE + max(256, frames) * (faces * _REACTION + 16)
     return frames * bodies * row + 8 * bodies + index
 
 
@@ -194,6 +200,8 @@ def rank_memory(scenario: Scenario, bodies: int, contacts: int, ranks: int) -> i
     moving = any(wall.motion is not None for wall in scenario.walls)
     base = _BASE
     contact = _CONTACT + 8 * columns * (_CONTACT_VECTORS + moving) + 8 * min(columns, 2)
+    if not only_spheres(scenario):
+        contact += 32  # arms are vectors
     if scenario.contact.operator == "assembled":
         base += _PETSC
         # D^T has for each of two bodies 3 entries in the normal row and 6 in either tangent's.
