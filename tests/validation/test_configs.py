@@ -29,7 +29,7 @@ def last_frame(path: Path, back: int = 0) -> dict[str, np.ndarray]:
 
 
 def measure(quantity: str, frame: dict[str, np.ndarray]) -> float:
-    """A header's quantity of a frame; bodies of one shape and material: mass goes with radius cubed."""
+    """A quantity of a frame; bodies of one shape and material: mass goes with radius cubed."""
     if quantity == "velocity_x_of_body_0":
         return float(frame["velocity"][frame["gid"] == 0, 0][0])
     weight = frame["radius"] ** 3
