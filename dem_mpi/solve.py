@@ -171,8 +171,9 @@ def _operator(problem: FclibProblem, parallel: Parallel) -> MatrixDelassus | Fac
 
 def _guess(problem: FclibProblem, name: str | None) -> NDArray:
     """The stored impulses of that name; zero where there is none, or they are all zero."""
-    zero = np.zeros((problem.contacts.count, COLUMNS))
-    return zero if name is None else problem.stored.get(name, zero)
+    if name not in problem.stored:
+        return np.zeros((problem.contacts.count, COLUMNS))
+    return problem.stored[name].copy()  # the solver works in it; the stored one is compared later
 
 
 def _write(
