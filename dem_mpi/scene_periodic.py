@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dem_mpi.periodic import AXES, PeriodicBox
+from dem_mpi.placement_checks import start_region
 from dem_mpi.scene_base import FACES
 from dem_mpi.scene_models import Scenario
 from dem_mpi.scene_walls import BoxWall, Motion, PlaneWall, RectangleWall
@@ -19,7 +20,7 @@ _STRAIGHT = 1e-12  # component of a unit normal that counts as none
 
 
 def periodic_violations(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
-    """(path, rule): periods shorter than bodies interact over, planes across a periodic axis."""
+    """(path, rule): too short periods, regions beyond the box, planes across a periodic axis."""
     box = PeriodicBox.of(scenario.domain)
     if box is None:
         return
@@ -31,6 +32,7 @@ def periodic_violations(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
             f"to {distance:.6g} m (their largest size, margin and skin)"
         )
         yield ("domain", "periodic"), rule
+    yield from _regions_beyond(scenario, box)
     for index, wall in enumerate(scenario.walls):
         for axis in scenario.domain.periodic:
             if isinstance(wall, BoxWall):
@@ -46,6 +48,23 @@ def periodic_violations(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:
             if isinstance(wall, (BoxWall, PlaneWall)) and _turns(wall.motion, AXES.index(axis)):
                 rule = f"turns an infinite plane about an axis other than the periodic axis {axis}"
                 yield ("walls", index, "motion", "rotation"), rule
+
+
+def _regions_beyond(scenario: Scenario, box: PeriodicBox) -> Iterator[tuple[KeyPath, str]]:
+    """Random places and inlets beyond a periodic face: who is there already is not seen there."""
+    for index, group in enumerate(scenario.bodies):
+        filled = start_region(group)
+        if filled is None:
+            continue
+        key, region = filled
+        slack = 1e-9 * box.period
+        beyond = (region.min < box.low - slack) | (region.max > box.high + slack)
+        for axis in np.flatnonzero(beyond & box.periodic):
+            rule = (
+                f"must lie within the domain along its periodic axis {AXES[axis]}: from "
+                f"{box.low[axis]:g} to {box.high[axis]:g} m"
+            )
+            yield ("bodies", index, "placement", key), rule
 
 
 def periodic_doubts(scenario: Scenario) -> Iterator[tuple[KeyPath, str]]:

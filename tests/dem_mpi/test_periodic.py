@@ -537,7 +537,13 @@ BODIES = {
 }
 BOX = {"shape": "box", "material": "m", "min": [0, 0, 0], "max": [1, 1, 1]}
 PLANE = {"shape": "plane", "material": "m", "point": [0, 0, 0]}
+BEYOND = {"min": [0.5, -3, 0], "max": [1.2, 4, 0.3]}
 TURN = {"rotation": {"centre": [0, 0, 0], "axis": [0, 0, 1], "rate": 1.0}}
+
+
+def filled(placement: dict) -> dict:
+    """A scene's bodies, placed so."""
+    return {"bodies": [{**BODIES, "placement": placement}]}
 
 
 @pytest.mark.parametrize(
@@ -547,8 +553,11 @@ TURN = {"rotation": {"centre": [0, 0, 0], "axis": [0, 0, 1], "rate": 1.0}}
         ({"walls": [{**BOX, "open": ["x_min"]}]}, "periodic along x: add x_max"),
         ({"walls": [{**PLANE, "normal": [0.1, 0, 1]}]}, "must not cut the periodic axis x"),
         ({"walls": [{**PLANE, "normal": [0, 0, 1], "motion": TURN}]}, "other than the periodic"),
+        # Bodies at home in the box are met there only through their nearest images.
+        (filled({"random": BEYOND}), r"placement.random = .*: must lie within the domain"),
+        (filled({"insertion": {**BEYOND, "rate": 1.0}}), r"placement.insertion = .*: must lie within the"),
     ],
-    ids=["short period", "closed box", "oblique plane", "turning plane"],
+    ids=["short period", "closed box", "oblique plane", "turning plane", "random", "inlet"],
 )
 def test_scenes_that_do_not_repeat_are_refused(sections, rule):
     with pytest.raises(InputError, match=rule):
