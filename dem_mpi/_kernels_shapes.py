@@ -57,9 +57,6 @@ from dem_mpi._kernels_wall_points import (
 SPHERE, SPHEROCYLINDER, SPHEROID = 0, 1, 2
 PLANE, RECTANGLE, FRUSTUM = 0, 1, 2
 
-# (body kind, wall kind, side) without exact contacts, for scenes to refuse: every one has them.
-UNSUPPORTED: frozenset[tuple[int, int, int]] = frozenset()
-
 
 # ---- sizes ---------------------------------------------------------------------------------
 

@@ -231,8 +231,9 @@ def gradient_step(gamma, gamma_old, g, g_old, beta, step, s, mu, gamma_new, d, p
 
     y = gamma + beta (gamma - gamma_old), g(y) likewise (N is linear),
     gamma_new = P_C(y - step s g(y)), d = gamma_new - y.
-    s : (m, 1 or 2) squared scaling of the normal and the tangents; with s_t != s_n the projection is orthogonal in the scaled
-    variables gamma/sqrt(s), in which the cone has friction mu sqrt(s_n/s_t).
+    s : (m, 1 or 2) squared scaling of the normal and the tangents; with s_t != s_n the projection
+    is orthogonal in the scaled variables gamma/sqrt(s), in which the cone has friction
+    mu sqrt(s_n/s_t).
     partial : (chunks, 2) scratch.
     """
     m, rows = gamma.shape
@@ -288,8 +289,9 @@ def gradient_step(gamma, gamma_old, g, g_old, beta, step, s, mu, gamma_new, d, p
 
 @jit_threads
 def curvature(g, g_old, beta, d, b, gamma_new, g_new, mu, partial):
-    """g_new = g(y) + N d, where g_new holds N d on entry; returns (d.N d, objective, max r_d, max |gamma.g|) of gamma_new.
+    """g_new = g(y) + N d; returns (d.N d, objective, max r_d, max |gamma.g|) of gamma_new.
 
+    g_new : (m, columns) holds N d on entry.
     r_d = max(0, mu |g_t| - g_n) [m/s]; objective = gamma.(g + b)/2.
     partial : (chunks, 4) scratch.
     """

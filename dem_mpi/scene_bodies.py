@@ -118,7 +118,6 @@ class MixRadius(Model):
     mix: Mix = note("The two sizes and their shares")
 
 
-RadiusDistribution = UniformRadius | LognormalRadius | WeightedRadius | MixRadius
 _DISTRIBUTIONS = {
     "uniform": UniformRadius,
     "lognormal": LognormalRadius,

@@ -193,11 +193,6 @@ def _shared_space(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Fi
             return
 
 
-def _length(extent: Extent) -> float:
-    """The longest edge [m]."""
-    return float(np.max(extent.high - extent.low))
-
-
 def _speed_doubts(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Finding]:
     """Bodies or walls that cross a radius within one step, so that contacts come too late."""
     step = scenario.time.step
