@@ -51,11 +51,16 @@ def arguments(description: str) -> argparse.ArgumentParser:
     return parser
 
 
-def write(records: list[Record], path: Path | None) -> None:
+def write(records: list[Record], path: Path | None = None) -> None:
     """Print the records, and write them as JSON if a path is given."""
     for r in records:
         versus = f"  {r.rival} {r.rival_value:.4g}  ratio {r.ratio:.3g}" if r.rival else ""
-        print(f"{r.name}  {json.dumps(r.params)}  {r.value:.5g} {r.unit}{versus}")
+        print(f"{r.name}  {json.dumps(r.params)}  {r.value:.5g} {r.unit}{versus}", flush=True)
+    save(records, path)
+
+
+def save(records: list[Record], path: Path | None) -> None:
+    """Write the records as JSON if a path is given."""
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps([asdict(r) for r in records], indent=1) + "\n")

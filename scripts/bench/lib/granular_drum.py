@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from lib.granular_runs import Run, run
+from numpy.typing import NDArray
 from records import Record
 
 RADIUS = 0.1  # [m] of the drum
@@ -22,30 +23,55 @@ class Steady:
 
     angle: float  # of the centre of mass from straight below the axis [degrees]
     scatter: float  # standard deviation of that angle from frame to frame [degrees]
+    surface: float  # slope of the free surface in the middle half of the drum [degrees]
     torque: float  # on the mantle about its axis [N m]
     torque_ratio: float  # torque over weight times lateral offset of the centre of mass
     power: float  # work of the mantle on the bed per time [W]
     power_ratio: float  # dissipation over work
 
 
+def surface_angle(position: NDArray[np.float64]) -> float:
+    """Slope [degrees] of the surface in the middle half of the drum, over frames (frames, n, 3).
+
+    In strips as wide as a sphere the highest centre of each frame; the median over the frames, which
+    leaves out spheres in flight; a straight line through the strips.
+    """
+    strips = int(0.5 * RADIUS / SPHERE)
+    strip = np.floor((position[:, :, 0] + 0.5 * RADIUS) / RADIUS * strips).astype(int)
+    inside = (strip >= 0) & (strip < strips)
+    highest = np.full((len(position), strips), -np.inf)
+    frame = np.broadcast_to(np.arange(len(position))[:, None], strip.shape)
+    np.maximum.at(highest, (frame[inside], strip[inside]), position[:, :, 2][inside])
+    slope = np.polyfit(np.arange(strips) * RADIUS / strips, np.median(highest, axis=0), 1)[0]
+    return float(np.degrees(np.arctan(-slope)))
+
+
 def steady(done: Run, start: float) -> Steady:
-    """Measure from `start` [s] to the end of a run of the drum, which turns about y."""
+    """Measure from `start` [s] to the end of a run of the drum, which turns about y.
+
+    Each step kicks every body by g h, and the contacts take back what is not needed to fall: of
+    what they dissipate, m g^2 h / 2 per time is that, and not the mantle's work.
+    """
     time, work, balance = done.metrics("time", "wall_work", "energy_balance")
     torque = done.reaction("mantle")[:, 4]
     window = time > start
-    frames = [(t, frame["position"]) for t, frame in done.frames("position") if t > start]
-    centre = np.array([position.mean(axis=0) for _, position in frames])
-    weight = DENSITY * 4.0 / 3.0 * np.pi * SPHERE**3 * GRAVITY * len(frames[0][1])
+    position = np.array([frame["position"] for t, frame in done.frames("position") if t > start])
+    centre = position.mean(axis=1)
+    weight = DENSITY * 4.0 / 3.0 * np.pi * SPHERE**3 * GRAVITY * position.shape[1]
     angle = np.degrees(np.arctan2(-centre[:, 0], -centre[:, 2]))
-    done_work = float(work[window].sum())
+    seconds = float(time[-1] - start)
+    power = float(work[window].sum()) / seconds
+    lost = power - float(balance[window].sum()) / seconds
+    kick = 0.5 * weight * GRAVITY * float(time[0])
     mean_torque = float(torque[window].mean())
     return Steady(
         angle=float(angle.mean()),
         scatter=float(angle.std()),
+        surface=surface_angle(position),
         torque=mean_torque,
         torque_ratio=mean_torque / (weight * float(centre[:, 0].mean())),
-        power=done_work / float(time[-1] - start),
-        power_ratio=(done_work - float(balance[window].sum())) / done_work,
+        power=power,
+        power_ratio=(lost - kick) / power,
     )
 
 
@@ -78,9 +104,10 @@ def study(quick: bool) -> tuple[list[Record], list[dict[str, Any]]]:
         found = steady(run("drum", overrides(mu, rate, count, end)), START)
         froude = rate**2 * RADIUS / GRAVITY
         params = {"mu": mu, "rate": rate, "froude": froude, "spheres": count}
-        rows.append({"mu": mu, "froude": froude, "angle": found.angle, "scatter": found.scatter})
+        rows.append({"mu": mu, "froude": froude} | asdict(found))
         for name, value, unit, error in (
             ("angle", found.angle, "degrees", found.scatter),
+            ("surface_angle", found.surface, "degrees", None),
             ("torque", found.torque, "N m", None),
             ("torque_ratio", found.torque_ratio, "1", abs(found.torque_ratio - 1.0)),
             ("power", found.power, "W", None),
@@ -105,9 +132,12 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
         (axes[1], "froude", same_friction, "Froude number"),
     ):
         angle, scatter = ([row[name] for row in chosen] for name in ("angle", "scatter"))
-        axis.errorbar([row[key] for row in chosen], angle, scatter, fmt="o-", capsize=3)
+        along = [row[key] for row in chosen]
+        axis.errorbar(along, angle, scatter, fmt="o-", capsize=3, label="centre of mass")
+        axis.plot(along, [row["surface"] for row in chosen], "s--", label="surface")
         axis.set_xlabel(label)
         axis.grid(True, alpha=0.25)
+    axes[1].legend()
     axes[0].set_ylabel("dynamic angle of repose [degrees]")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)

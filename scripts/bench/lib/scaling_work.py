@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mpi4py import MPI
 
@@ -213,26 +214,22 @@ def begin(parallel: Parallel, scenario: Scenario) -> State:
 def two_sizes(parallel: Parallel, scenario: Scenario, ratio: float) -> State:
     """Collective. A bed with as many large spheres sunk into its top as lie there side by side.
 
-    A large sphere takes the place of the small ones that it would touch or come closer to than
-    half a radius.
+    A large sphere takes the place of the small ones that it would overlap.
     """
     arrays = place(parallel, scenario)
     small = float(arrays["radius"][0])
     large = ratio * small
     box = scenario.walls[0]
     top = float(arrays["position"][:, 2].max())
+    depth = 4.0 * small
     across = [max(1, int((box.max[k] - box.min[k]) / (2.02 * large))) for k in range(2)]
     if ratio > 1.0:
-        depth = min(large, 0.5 * top)
         x, y = (box.min[k] + (np.arange(n) + 0.5) * (box.max[k] - box.min[k]) / n
                 for k, n in enumerate(across))  # fmt: skip
         centre = np.stack([*map(np.ravel, np.meshgrid(x, y)), np.zeros(len(x) * len(y))], axis=1)
         centre[:, 2] = top - depth + large
-        apart = np.full(len(arrays["position"]), np.inf)
-        for point in centre:
-            distance = np.sqrt(np.sum((arrays["position"] - point) ** 2, axis=1))
-            np.minimum(apart, distance, out=apart)
-        stay = np.flatnonzero(apart > large + 1.5 * small)
+        apart, _ = cKDTree(centre).query(arrays["position"])
+        stay = np.flatnonzero(apart > large + small)
         arrays = {name: array[stay] for name, array in arrays.items()}
         extra = {name: np.repeat(array[:1], len(centre), axis=0) for name, array in arrays.items()}
         extra |= {"position": centre, "radius": np.full(len(centre), large)}
