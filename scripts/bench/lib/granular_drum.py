@@ -33,8 +33,8 @@ class Steady:
 def surface_angle(position: NDArray[np.float64]) -> float:
     """Slope [degrees] of the surface in the middle half of the drum, over frames (frames, n, 3).
 
-    In strips as wide as a sphere the highest centre of each frame; the median over the frames, which
-    leaves out spheres in flight; a straight line through the strips.
+    In strips about as wide as a sphere the highest centre of each frame; the median over the
+    frames, which leaves out spheres in flight; a straight line through the strips.
     """
     strips = int(0.5 * RADIUS / SPHERE)
     strip = np.floor((position[:, :, 0] + 0.5 * RADIUS) / RADIUS * strips).astype(int)
