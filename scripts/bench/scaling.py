@@ -147,15 +147,20 @@ class Run:
         return np.median(self.column(name, "solve") / products[:, None], axis=0)
 
     def peak(self, phase: str | None = None) -> float:
-        """Largest resident size [B] of the fullest rank beyond what it had before the scene."""
-        base = np.array(self.found["memory"])[:, 0]
-        peak = self._columns["peak"].max(axis=0)
-        column = peak.max(axis=1) if phase is None else peak[:, self.found["phases"].index(phase)]
+        """Largest resident size [B] of the fullest rank beyond what it had before the scene.
+
+        In one phase of the steps or in "placement"; else in any.
+        """
+        base, placed = np.array(self.found["memory"]).T
+        peaks = dict(zip(self.found["phases"], self._columns["peak"].max(axis=0).T, strict=True))
+        peaks["placement"] = placed
+        column = np.max(list(peaks.values()), axis=0) if phase is None else peaks[phase]
         return float((column - base).max())
 
     def memory(self) -> NDArray:
         """Largest resident size [B] of each rank, program included."""
-        return self._columns["peak"].max(axis=(0, 2))
+        placed = np.array(self.found["memory"])[:, 1]
+        return np.maximum(self._columns["peak"].max(axis=(0, 2)), placed)
 
     def total_memory(self) -> float:
         """Sum over ranks of the largest resident size [B], program included."""
@@ -277,7 +282,7 @@ def memory(sizes: Sizes) -> list[Record]:
                 loose.peak() / sizes.memory, "B",
             )
         )  # fmt: skip
-        for phase in (*DETECTION, "assemble", "solve", "advance"):
+        for phase in ("placement", *DETECTION, "assemble", "solve", "advance"):
             more = wide.contacts - dense.contacts
             params = base | {"contacts": [dense.contacts, wide.contacts]}
             records.append(

@@ -115,9 +115,10 @@ def steps(parallel: Meter, task: dict[str, Any]) -> dict[str, Any]:
     """
     scenario = scene_of(task)
     base = resident_memory()
+    reset_peak()
     began = perf_counter()
     state = begin(parallel, scenario)
-    placed = perf_counter() - began
+    placed, placed_peak = perf_counter() - began, peak_memory()
     simulation = Simulation(parallel, scenario, state)
     probe = simulation.timer = Probe(parallel)
     rows, reason = [], ""
@@ -141,7 +142,7 @@ def steps(parallel: Meter, task: dict[str, Any]) -> dict[str, Any]:
         rows.append(row)
         if parallel.any(perf_counter() - began > task.get("seconds", math.inf)):
             break
-    memory = parallel.allgather(np.array([base, resident_memory()])).tolist()
+    memory = parallel.allgather(np.array([base, placed_peak])).tolist()
     simulation.destroy()
     return {
         "phases": PHASES,
