@@ -3,8 +3,8 @@
     python scripts/bench/granular.py STUDY [--quick] [--json FILE] [--figure FILE]
 
 hopper: mass flow against the width of the outlet. drum: angle of repose against friction and
-speed, torque and power balance. On one core; finished runs stay under build/bench and are taken
-from there. FILE of --json keeps the records of the other studies. docs/validation.md explains the
+speed, torque and power balance. column: run-out of a collapsing column against its aspect ratio.
+On one core; finished runs stay under build/bench and are taken from there. FILE of --json keeps the records of the other studies. docs/validation.md explains the
 figures.
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from lib import granular_drum, granular_hopper
+from lib import granular_column, granular_drum, granular_hopper
 from records import Record, arguments, write
 
 
@@ -29,6 +29,7 @@ class Study(NamedTuple):
 STUDIES = {
     "hopper": Study(granular_hopper.study, granular_hopper.draw),
     "drum": Study(granular_drum.study, granular_drum.draw),
+    "column": Study(granular_column.study, granular_column.draw),
 }
 
 
