@@ -4,8 +4,8 @@
 
 hopper: mass flow against the width of the outlet. drum: angle of repose against friction and
 speed, torque and power balance. column: run-out of a collapsing column against its aspect ratio.
-On one core; finished runs stay under build/bench and are taken from there. FILE of --json keeps the records of the other studies. docs/validation.md explains the
-figures.
+On one core; finished runs stay under build/bench and are taken from there. FILE of --json keeps
+the records of the other studies. docs/validation.md explains the figures.
 """
 
 from __future__ import annotations
