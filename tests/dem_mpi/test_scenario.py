@@ -439,8 +439,9 @@ def _is_numeric(node: object) -> bool:
 def test_there_are_shipped_scenes():
     names = {path.stem for path in CONFIGS}
     assert names >= {
-        "incline", "quick", "sediment_archive", "sedimentation", "sedimentation_100k",
-        "two_body_impact", "weak_scaling",
+        "column_collapse", "drum", "hopper", "hopper_slot", "incline", "quick", "rods",
+        "sediment_archive", "sedimentation", "sedimentation_100k", "shear_box", "two_body_impact",
+        "weak_scaling",
     }  # fmt: skip
 
 
