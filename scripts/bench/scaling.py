@@ -625,7 +625,7 @@ def _draw_detection(axis: Any, records: list[Record]) -> None:
         label = f"size ratio {r.name.rpartition('.')[2]}"
         axis.semilogx([r.params["spheres"]], [r.value], "s", color=f"C{k + 1}", label=label)
     axis.set(xlabel="bodies", ylabel="ns a body, 1 rank", title="new pair list and contacts")
-    axis.set_ylim(bottom=0)
+    axis.set_ylim(0, 1.1 * axis.get_ylim()[1])
     axis.legend(fontsize=8)
 
 
@@ -648,6 +648,7 @@ def _draw_bytes(axis: Any, records: list[Record]) -> None:
     for r in check:
         axis.plot([r.ranks], [r.params["foretold"] / 1e3], "kx", label="foretold from fewer ranks")
     a_rank = rows[0].params["spheres_a_rank"] if rows else 0
+    axis.set_ylim(bottom=0)
     axis.set(xlabel="ranks", ylabel="kB a product and rank", title=f"{a_rank} spheres a rank")
     axis.legend(fontsize=8)
 
