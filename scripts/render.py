@@ -22,7 +22,8 @@ import vtk
 from numpy.typing import NDArray
 from vtk.util.numpy_support import numpy_to_vtk
 
-from dem_mpi.scenario import BoxWall, Scenario, restore_scenario
+from dem_mpi.scenario import Scenario, restore_scenario
+from dem_mpi.scene_walls import BoxWall
 
 _WHITE, _INK, _WALL = (1.0, 1.0, 1.0), (0.12, 0.12, 0.14), (0.45, 0.47, 0.50)
 
