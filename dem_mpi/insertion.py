@@ -19,7 +19,7 @@ from dem_mpi.bodies import Bodies
 from dem_mpi.counter_random import Purpose, key_of, uniform
 from dem_mpi.parallel import Parallel
 from dem_mpi.periodic import PeriodicBox
-from dem_mpi.placement import bodies_of, reaches
+from dem_mpi.placement import bodies_of, first_gids, group_counts, reaches
 from dem_mpi.scenario import Scenario
 from dem_mpi.scene_bodies import BodyGroup, Insertion
 from dem_mpi.sizes import smallest_radius, thinnest_half
@@ -80,10 +80,22 @@ def due(group: BodyGroup, time: float) -> int:
     return 0 if number < 0.0 else min(group.count, math.floor(number) + 1)
 
 
-def arrive(parallel: Parallel, scenario: Scenario, state: State, time: float) -> Arrivals:
+def reserved_gids(scenario: Scenario) -> list[int]:
+    """The gid of each group's first body, looked up once: files may change while a run goes on.
+
+    Empty where nothing is inserted.
+    """
+    if not any(is_inlet(group) for group in scenario.bodies):
+        return []
+    return first_gids(group_counts(scenario))
+
+
+def arrive(
+    parallel: Parallel, scenario: Scenario, reserved: list[int], state: State, time: float
+) -> Arrivals:
     """Collective. Find places for the bodies that are due at `time` [s]; `state` stays as it is.
 
-    Without anybody due nothing is sent.
+    Without anybody due nothing is sent. `reserved` comes from `reserved_gids`.
     """
     inserted = _counters(state.inserted, len(scenario.bodies))
     pending = [
@@ -98,7 +110,8 @@ def arrive(parallel: Parallel, scenario: Scenario, state: State, time: float) ->
     for queue, position in zip(queues, place, strict=True):
         found = len(position)
         inserted[queue.number] += found
-        arrays = bodies_of(scenario, queue.number, queue.index[:found], position)
+        first_gid = reserved[queue.number]
+        arrays = bodies_of(scenario, queue.number, first_gid, queue.index[:found], position)
         mine = state.partition.owner(position, arrays["gid"]) == parallel.rank
         parts.append({name: array[mine] for name, array in arrays.items()})
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

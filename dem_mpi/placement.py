@@ -172,7 +172,8 @@ def _place_at_random(
         parallel, group, scenario.seed, number, index,
         reaches(group, scenario.seed, number, index), np.concatenate(obstacles),
     )  # fmt: skip
-    return bodies_of(scenario, number, placed.index, placed.position)
+    first_gid = first_gids(group_counts(scenario))[number]
+    return bodies_of(scenario, number, first_gid, placed.index, placed.position)
 
 
 def place_share(scenario: Scenario, rank: int, size: int) -> dict[str, np.ndarray]:
@@ -185,7 +186,7 @@ def place_share(scenario: Scenario, rank: int, size: int) -> dict[str, np.ndarra
         start, stop = (min(max(gid - offsets[number], 0), counts[number]) for gid in (first, last))
         if not group.placement.stands_at_start:
             stop = start
-        parts.append(_place_group(scenario, number, counts[number], start, stop))
+        parts.append(_place_group(scenario, number, offsets[number], counts[number], start, stop))
     return _joined(parts)
 
 
@@ -212,7 +213,7 @@ def _open_file(group: BodyGroup) -> BodyFile:
 
 
 def _place_group(
-    scenario: Scenario, number: int, count: int, start: int, stop: int
+    scenario: Scenario, number: int, first_gid: int, count: int, start: int, stop: int
 ) -> dict[str, np.ndarray]:
     """Bodies start <= index < stop of one group on a grid or in a file."""
     group, n = scenario.bodies[number], stop - start
@@ -227,24 +228,27 @@ def _place_group(
             raise InputError(f"bodies[{number}].count = {count}: only {cells.capacity} fit")
         random = _words(scenario, number, index)[:, _POSITION]
         position = cells.centres(start, stop) + (2 * random - 1) * np.array(cells.shift)
-    return bodies_of(scenario, number, index, stated.pop("position", position), stated)
+    position = stated.pop("position", position)
+    return bodies_of(scenario, number, first_gid, index, position, stated)
 
 
 def bodies_of(
     scenario: Scenario,
     number: int,
+    first_gid: int,
     index: np.ndarray,
     position: np.ndarray,
     stated: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
     """All arrays of the bodies `index` (n,) of group `number` at `position` (n, 3) [m].
 
-    What `stated` holds replaces what the group says. The arrays are those of `place`.
+    `first_gid` is that of the group's body 0. What `stated` holds replaces what the group says.
+    The arrays are those of `place`.
     """
     group, n = scenario.bodies[number], len(index)
     random = _words(scenario, number, index)
     bodies = {
-        "gid": first_gids(group_counts(scenario))[number] + np.asarray(index, dtype=np.int64),
+        "gid": first_gid + np.asarray(index, dtype=np.int64),
         "material": np.full(n, list(scenario.materials).index(group.material), dtype=np.int32),
         "shape": np.full(n, SHAPES.index(group.shape), dtype=np.int8),
         "position": position,

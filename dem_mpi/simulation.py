@@ -157,6 +157,7 @@ class Simulation:
         state.rotating = state.rotating or self._general
         self._gravity = np.array(scenario.gravity)
         self._faces = wall_faces(scenario)
+        self._reserved = insertion.reserved_gids(scenario)
         if state.wall_impulse.shape[0] != len(self._faces.name):
             state.wall_impulse, state.wall_time = np.zeros((len(self._faces.name), 6)), 0.0
         contact = scenario.contact
@@ -394,7 +395,7 @@ class Simulation:
         if not self.expected:
             return 0
         with self.timer.phase("partition"):
-            arrivals = insertion.arrive(self.parallel, self.scenario, state, time)
+            arrivals = insertion.arrive(self.parallel, self.scenario, self._reserved, state, time)
             arrived = int(arrivals.inserted.sum() - state.inserted.sum())
             state.inserted = arrivals.inserted
             if arrived:

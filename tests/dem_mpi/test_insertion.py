@@ -129,6 +129,18 @@ def test_gids_are_reserved_for_a_group_whenever_it_comes():
     assert sorted(simulation.state.bodies.gid) == [0, 1, 2, 3, 4, 7, 8, 9, 10]
 
 
+def test_gids_stay_reserved_when_a_file_of_bodies_changes_during_the_run(tmp_path: Path):
+    file = tmp_path / "two.csv"
+    file.write_text("x,y,z\n0.6,0,0\n0.8,0,0\n")
+    first = {"material": "m", "radius": 0.05, "placement": {"file": str(file)}}
+    scenario = scene(step=STEP, gravity=(0, 0, 0), bodies=[first, inlet(2, 500)])
+    simulation = started(Parallel.alone(), scenario)
+    simulation.step()
+    file.unlink()
+    simulation.step()
+    assert sorted(simulation.state.bodies.gid) == [0, 1, 2, 3]
+
+
 def test_bodies_wait_while_the_region_is_blocked_and_come_in_when_it_is_free():
     """A ball as large as the region leaves it at 2 m/s along x; then all five come in."""
     group = inlet(5, 1000, velocity=[0, 0, 0])
