@@ -172,6 +172,7 @@ def draw(columns: list[Collapse], path: Path) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import FixedLocator, FormatStrFormatter, NullFormatter
 
     figure, axes = plt.subplots(figsize=(6, 4.5), constrained_layout=True)
     a = np.array([c.aspect for c in columns])
@@ -186,6 +187,10 @@ def draw(columns: list[Collapse], path: Path) -> None:
     for part in (fine < BREAK, fine >= BREAK):
         label = "Lube et al. 2004: 1.24 a, 1.6 a^0.5" if part[0] else None
         axes.loglog(fine[part], lube(fine[part]), "k-", lw=1, label=label)
+    for axis, ticks in ((axes.xaxis, (0.5, 1, 2, 5)), (axes.yaxis, (0.5, 1, 2, 4))):
+        axis.set_major_locator(FixedLocator(ticks))
+        axis.set_major_formatter(FormatStrFormatter("%g"))
+        axis.set_minor_formatter(NullFormatter())
     axes.set_xlabel("aspect ratio a = H0 / R0")
     axes.set_ylabel("run-out (r - R0) / R0")
     axes.grid(True, which="both", alpha=0.25)
