@@ -23,6 +23,7 @@ GRAVITY = 9.81
 BIN = 0.08  # [m] radius
 SLOPE = 1.5  # rise over run of the cone: 34 degrees from the axis
 OPENING = 0.35  # [s] when the shutter vanishes
+FORMING = 0.12  # [s] to start from rest, and to fall to where bodies are taken out
 FILL = 2 * SAUTER  # [m] the lowest bodies start that far above the cone
 
 
@@ -70,9 +71,9 @@ def overrides(ratio: float, count: int, discharge: float, **more: Any) -> dict[s
 
 
 def flow(ratio: float, done: Run, discharge: float) -> Flow:
-    """Measure W from a fifth of the discharge's time to its end, as recorded."""
+    """Measure W once the flow has formed, from a fifth of the watch at least, to its end."""
     time, mass, number, overlap = done.metrics("time", "removed_mass", "removed", "overlap")
-    window = time >= OPENING + 0.2 * discharge
+    window = time >= OPENING + max(0.2 * discharge, FORMING)
     t, m, n = time[window], mass[window], number[window]
     slope, start = np.polyfit(t, m, 1)
     half = len(t) // 2
@@ -103,6 +104,13 @@ def fit(ratio: NDArray, rate: NDArray) -> Beverloo:
     )
 
 
+def error_of_k(ratio: NDArray, rate: NDArray, scatter: float) -> float:
+    """Standard error of k where every W has a relative error of `scatter` on its own."""
+    k = fit(ratio, rate).k
+    shifted = rate * (1.0 + scatter * np.eye(len(rate)))
+    return float(np.sqrt(sum((fit(ratio, row).k - k) ** 2 for row in shifted)))
+
+
 # ---- the study ------------------------------------------------------------------------------
 
 # D / d, and how long the outlet is watched [s]: as long as the bed still covers the cone.
@@ -119,29 +127,31 @@ def study(quick: bool) -> tuple[list[Record], dict[str, Any]]:
     watched = {ratio: share * seconds for ratio, seconds in outlets}
     seeds = SEEDS[:1] if quick else SEEDS
     flows: dict[tuple[float, int], Flow] = {}
-    runs = {}
 
     def discharge(ratio: float, **more: Any) -> Flow:
-        runs["last"] = run("hopper", overrides(ratio, count, watched[ratio], **more))
-        return flow(ratio, runs["last"], watched[ratio])
+        done = run("hopper", overrides(ratio, count, watched[ratio], **more))
+        return flow(ratio, done, watched[ratio])
 
     for ratio in watched:
         for seed in seeds if ratio == VARIED else seeds[:1]:
             flows[ratio, seed] = discharge(ratio, seed=seed)
     records = [_flow_record(found, count, {"seed": seed}) for (_, seed), found in flows.items()]
-    mean = [np.mean([f.rate for (r, _), f in flows.items() if r == ratio]) for ratio in watched]
-    law = fit(np.array(list(watched)), np.array(mean))
-    params = {"spheres": count, "outlets": list(watched), "d": SAUTER, "bulk_density": BULK_DENSITY}
+    ratios = np.array(list(watched))
+    mean = np.array([np.mean([f.rate for f in flows.values() if f.ratio == r]) for r in ratios])
+    law = fit(ratios, mean)
     if not quick:  # two outlets make any line fit
-        records += [
-            Record("granular.hopper.k", params, law.k, "1", error=1.0 - law.r_squared),
-            Record("granular.hopper.C", params, law.C, "1", error=1.0 - law.r_squared),
-            Record("granular.hopper.r_squared", params, law.r_squared, "1"),
-        ]
-        rates = [found.rate for (ratio, _), found in flows.items() if ratio == VARIED]
+        rates = [found.rate for found in flows.values() if found.ratio == VARIED]
         scatter = float(np.std(rates, ddof=1) / np.mean(rates))
+        params = {"spheres": count, "outlets": list(watched), "d": SAUTER}
+        params |= {"bulk_density": BULK_DENSITY}
         about = {"spheres": count, "ratio": VARIED}
-        records.append(Record("granular.hopper.scatter", about, scatter, "1", runs=len(rates)))
+        error = error_of_k(ratios, mean, scatter)
+        records += [
+            Record("granular.hopper.k", params, law.k, "1", error=error),
+            Record("granular.hopper.C", params, law.C, "1"),
+            Record("granular.hopper.r_squared", params, law.r_squared, "1"),
+            Record("granular.hopper.scatter", about, scatter, "1", runs=len(rates)),
+        ]
         finer = {"time.step": 5e-4}
         tighter = {"contact.tolerance": 1e-4, "contact.complementarity": 1e-3}
         records += [
