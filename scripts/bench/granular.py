@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from lib import granular_column, granular_drum, granular_hopper
-from records import Record, arguments, write
+from records import Record, arguments, save, write
 
 
 class Study(NamedTuple):
@@ -48,7 +48,8 @@ def main() -> None:
     options = parser.parse_args()
     study = STUDIES[options.study]
     records, found = study.run(options.quick)
-    write([*others(options.json, options.study), *records], options.json)
+    write(records)
+    save([*others(options.json, options.study), *records], options.json)
     if options.figure:
         study.draw(found, options.figure)
 

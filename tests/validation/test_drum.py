@@ -47,8 +47,9 @@ def test_the_mantle_works_as_its_torque_says_and_energy_is_accounted_for_in_ever
 ) -> None:
     """The bodies' kinetic energy changes by what the contacts took and the walls gave; what they
     gave is the mantle's torque times its angle. Both to round-off, from the first touch through
-    the bed's fall on the turning mantle to its first tilt; the polished plates do no work."""
-    steps = run_drum(ranks, tmp_path, time__end=0.4)
+    the bed's fall on the turning mantle to its first tilt, at whatever tolerance the contacts are
+    solved (a coarse one here, for speed); the polished plates do no work."""
+    steps = run_drum(ranks, tmp_path, time__end=0.3, contact__tolerance=1e-2)
     change, balance = column(steps, "energy_change"), column(steps, "energy_balance")
     kinetic, work = column(steps, "kinetic_energy"), column(steps, "wall_work")
     h = steps[0]["time"]
