@@ -136,7 +136,10 @@ def place_at_random(
         work.add_obstacles(near)
         left = work.place_all(*bodies, largest)
         if not left:
-            return work.placed()
+            placed = work.placed()
+            if parallel.sum(len(placed.index)) != total:
+                raise RuntimeError(f"bodies[{number}]: of {total} bodies some were lost")
+            return placed
         if left > 5.0 + _HOPELESS_PART * total:
             break
     raise InputError(
@@ -231,7 +234,9 @@ class _Work:
 
     def place_all(self, index: NDArray, reach: NDArray, largest: float) -> int:
         """Collective. Place bodies, the large ones first; how many found no place on all ranks."""
-        classes = np.floor(_CLASSES_PER_OCTAVE * np.log2(largest / reach)).astype(np.int64)
+        # A drawn radius may be rounded to a bit above the largest: it is still of the first class.
+        octaves = np.maximum(0.0, np.log2(largest / reach))
+        classes = np.floor(_CLASSES_PER_OCTAVE * octaves).astype(np.int64)
         for c in range(self._parallel.max(int(classes.max(initial=0))) + 1):
             mine = classes == c
             left = self._place_class(index[mine], reach[mine])

@@ -243,3 +243,13 @@ def test_the_count_that_a_refusal_offers_is_accepted():
     load(bodies=[random_group(count, 0.05)])
     with pytest.raises(InputError):
         load(bodies=[random_group(count + 1, 0.05)])
+
+
+def test_a_radius_rounded_above_the_largest_loses_no_body():
+    """low + (high - low) u may be rounded up past high."""
+    group = group_of(count=50, radius=0.02)
+    reach = np.full(50, 0.02)
+    reach[::2] = np.nextafter(0.02, 1.0)
+    nothing = np.zeros((0, 4))
+    placed = place_at_random(Parallel.alone(), group, 1, 0, np.arange(50), reach, nothing)
+    assert sorted(placed.index) == list(range(50))
