@@ -1,10 +1,11 @@
 #!/usr/bin/env python
-"""Draw a frame of a trajectory without a screen: shaded spheres, walls as outlines.
+"""Draw a frame of a trajectory without a screen: shaded bodies, boxes as outlines.
 
     .venv/bin/python scripts/render.py run.h5 [--frame last|K] [--colour height|speed]
 
 Needs the extra `render` (scripts/bootstrap --with render) and, where no screen is, libosmesa6.
-The file must hold radius, and velocity for colour by speed (both are written by default).
+The file must hold radius, and velocity for colour by speed (both are written by default); for
+bodies that are not spheres also orientation, half_length and shape (output.fields).
 """
 
 from __future__ import annotations
@@ -23,9 +24,12 @@ from numpy.typing import NDArray
 from vtk.util.numpy_support import numpy_to_vtk
 
 from dem_mpi.scenario import Scenario, restore_scenario
+from dem_mpi.scene_bodies import SHAPES
 from dem_mpi.scene_walls import BoxWall
 
 _WHITE, _INK, _WALL = (1.0, 1.0, 1.0), (0.12, 0.12, 0.14), (0.45, 0.47, 0.50)
+
+_RODS, _SPHEROIDS = SHAPES.index("spherocylinder"), SHAPES.index("spheroid")
 
 # Perceptually even, readable in grey and by the colour-blind; pale enough at its ends for shading.
 _COLOURS = ((0.13, 0.24, 0.47), (0.14, 0.52, 0.60), (0.49, 0.75, 0.52), (0.96, 0.85, 0.42))
@@ -33,10 +37,13 @@ _COLOURS = ((0.13, 0.24, 0.47), (0.14, 0.52, 0.60), (0.49, 0.75, 0.52), (0.96, 0
 
 @dataclass(frozen=True)
 class Picture:
-    """What is drawn: position (n, 3), radius (n,) [m], value (n,) and its label, walls, title."""
+    """What is drawn: n bodies, a value (n,) of each and its label, walls, title."""
 
-    position: NDArray
-    radius: NDArray
+    position: NDArray  # (n, 3) [m]
+    radius: NDArray  # (n,) [m]
+    shape: NDArray  # (n,) index into SHAPES
+    half_length: NDArray  # (n,) [m] as in the trajectory
+    orientation: NDArray  # (n, 4) unit quaternions, scalar first
     value: NDArray
     label: str
     boxes: tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
@@ -88,8 +95,24 @@ def read(path: Path, frame: str, colour: str) -> Picture:
         else:
             value, label = position[:, 2], "height, m"
         scenario = restore_scenario(json.loads(file.attrs["scene"]), path.parent)
-        title = f"{count:,} spheres at t = {file['frames/time'][k]:.3g} s"
-    return Picture(position, radius, value, label, _boxes(scenario), title)
+        shape, half_length, orientation = _shapes(file, rows, count, scenario)
+        kind = "bodies" if shape.any() else "spheres"
+        title = f"{count:,} {kind} at t = {file['frames/time'][k]:.3g} s"
+    return Picture(
+        position, radius, shape, half_length, orientation, value, label, _boxes(scenario), title
+    )
+
+
+def _shapes(
+    file: h5py.File, rows: slice, count: int, scenario: Scenario
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Shape, half length and orientation of a frame; a scene of spheres need not have them."""
+    if all(group.shape == "sphere" for group in scenario.bodies):
+        return np.zeros(count, np.int8), np.zeros(count), np.tile([1.0, 0, 0, 0], (count, 1))
+    missing = [name for name in ("shape", "half_length", "orientation") if name not in file]
+    if missing:
+        raise ValueError(f"bodies that are not spheres need {', '.join(missing)} in output.fields")
+    return file["shape"][rows], file["half_length"][rows], file["orientation"][rows]
 
 
 def _boxes(scenario: Scenario) -> tuple:
@@ -106,7 +129,8 @@ def draw(picture: Picture, figure: Path, width: int) -> None:
     renderer = vtk.vtkRenderer()
     renderer.SetBackground(*_WHITE)
     table = _colour_table(picture.value)
-    renderer.AddActor(_spheres(picture, table))
+    for solids in _solids(picture, table):
+        renderer.AddActor(solids)
     for low, high in picture.boxes:
         renderer.AddActor(_outline(low, high))
     renderer.AddViewProp(_legend(table, picture.label, width))
@@ -138,27 +162,79 @@ def _colour_table(value: NDArray) -> vtk.vtkLookupTable:
     return table
 
 
-def _spheres(picture: Picture, table: vtk.vtkLookupTable) -> vtk.vtkActor:
-    """Return one shaded sphere a body: a polygonal sphere copied by the graphics library."""
+def _solids(picture: Picture, table: vtk.vtkLookupTable) -> list[vtk.vtkActor]:
+    """Return the bodies as stretched balls, and rods as tubes with a ball at either end."""
+    fine = 32 if len(picture.radius) < 10_000 else 16
+    ball = vtk.vtkSphereSource()  # of diameter 1
+    ball.SetThetaResolution(fine)
+    ball.SetPhiResolution(fine // 2)
+    width, length = 2.0 * picture.radius, 2.0 * picture.half_length
+    rods = picture.shape == _RODS
+    thick = np.where(picture.shape == _SPHEROIDS, length, width)
+    caps = 0.5 * length[rods, None] * _axis(picture.orientation[rods])
+    place = picture.position
+    position = np.concatenate([place[~rods], place[rods] + caps, place[rods] - caps])
+    rows = np.concatenate([np.flatnonzero(~rods), *2 * [np.flatnonzero(rods)]])
+    scale = np.stack([width, width, thick], axis=1)[rows]
+    turned = picture.orientation[rows] if picture.shape.any() else None
+    actors = [_glyphs(ball, position, scale, turned, picture.value[rows], table)]
+    if rods.any():
+        scale = np.stack([width, width, length], axis=1)[rods]
+        turned = picture.orientation[rods]
+        actors.append(_glyphs(_tube(fine), place[rods], scale, turned, picture.value[rods], table))
+    return actors
+
+
+def _axis(orientation: NDArray) -> NDArray:
+    """Return the bodies' own z axes (n, 3) in the world."""
+    w, x, y, z = orientation.T
+    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+
+
+def _tube(fine: int) -> vtk.vtkTubeFilter:
+    """Return an open cylinder of diameter 1 and length 1 along z."""
+    line = vtk.vtkLineSource()
+    line.SetPoint1(0.0, 0.0, -0.5)
+    line.SetPoint2(0.0, 0.0, 0.5)
+    tube = vtk.vtkTubeFilter()
+    tube.SetInputConnection(line.GetOutputPort())
+    tube.SetRadius(0.5)
+    tube.SetNumberOfSides(fine)
+    tube.CappingOff()
+    return tube
+
+
+def _glyphs(
+    source: vtk.vtkAlgorithm,
+    position: NDArray,
+    scale: NDArray,
+    orientation: NDArray | None,
+    value: NDArray,
+    table: vtk.vtkLookupTable,
+) -> vtk.vtkActor:
+    """Return shaded copies of a polygonal source, stretched by scale (n, 3), then turned."""
     points = vtk.vtkPoints()
-    points.SetData(numpy_to_vtk(np.ascontiguousarray(picture.position), deep=True))
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(position), deep=True))
     data = vtk.vtkPolyData()
     data.SetPoints(points)
-    for name, column in (("scale", 2.0 * picture.radius), ("value", picture.value)):
+    columns = {"scale": scale, "value": value}
+    if orientation is not None:
+        columns["orientation"] = orientation
+    for name, column in columns.items():
         array = numpy_to_vtk(np.ascontiguousarray(column), deep=True)
         array.SetName(name)
         data.GetPointData().AddArray(array)
     data.GetPointData().SetActiveScalars("value")
 
-    ball = vtk.vtkSphereSource()  # of diameter 1
-    fine = 32 if len(picture.radius) < 10_000 else 16
-    ball.SetThetaResolution(fine)
-    ball.SetPhiResolution(fine // 2)
     mapper = vtk.vtkGlyph3DMapper()
     mapper.SetInputData(data)
-    mapper.SetSourceConnection(ball.GetOutputPort())
+    mapper.SetSourceConnection(source.GetOutputPort())
     mapper.SetScaleArray("scale")
-    mapper.SetScaleModeToScaleByMagnitude()
+    mapper.SetScaleModeToScaleByVectorComponents()
+    mapper.SetOrient(orientation is not None)
+    if orientation is not None:
+        mapper.SetOrientationArray("orientation")
+        mapper.SetOrientationModeToQuaternion()
     mapper.SetLookupTable(table)
     mapper.UseLookupTableScalarRangeOn()
     actor = vtk.vtkActor()
@@ -230,8 +306,9 @@ def _shade_crevices(renderer: vtk.vtkRenderer, picture: Picture) -> None:
 
 def _aim(renderer: vtk.vtkRenderer, picture: Picture) -> None:
     """Look at the bodies from a corner, a little from above; open walls may reach out of view."""
-    low = np.min(picture.position - picture.radius[:, None], axis=0, initial=np.inf)
-    high = np.max(picture.position + picture.radius[:, None], axis=0, initial=-np.inf)
+    reach = (picture.radius + picture.half_length)[:, None]
+    low = np.min(picture.position - reach, axis=0, initial=np.inf)
+    high = np.max(picture.position + reach, axis=0, initial=-np.inf)
     if not np.all(low <= high):
         low, high = np.zeros(3), np.ones(3)
     centre, span = 0.5 * (low + high), float(np.linalg.norm(high - low))
