@@ -87,3 +87,36 @@ def test_a_frame_that_is_not_there_is_refused(trajectory, tmp_path):
     assert done.returncode == 65
     assert "the file holds 2, numbered from 0" in done.stderr
     assert not (tmp_path / "none.png").exists()
+
+
+@pytest.mark.parametrize("shape", ["spherocylinder", "spheroid"])
+@pytest.mark.parametrize("axis", ["x", "z"])
+def test_long_bodies_point_where_they_point(shape, axis, tmp_path):
+    """One body six times as long as wide: the picture of a lying one is wider than high, and that
+    of a standing one higher than wide."""
+    direction = {"x": "[1, 0, 0]", "z": "[0, 0, 1]"}[axis]
+    group = f"shape: {shape}, aspect_ratio: 6, axis: {direction}, material: glass, count: 1"
+    scene = SCENE.replace("material: glass, count: 8", group).replace("radius: 0.1", "radius: 0.03")
+    fields = "output: {fields: [position, orientation, radius, half_length, shape]}\n"
+    (tmp_path / "scene.yaml").write_text(scene + fields)
+    arguments = ["-m", "dem_mpi", "run", tmp_path / "scene.yaml", "--out", tmp_path]
+    done = run_ranks(1, arguments, timeout=300)
+    assert done.returncode == 0, done.stderr
+    figure = tmp_path / "long.png"
+    done = render(tmp_path / "run.h5", "--figure", figure, "--width", 400)
+    assert done.returncode == 0, done.stderr
+    image = pixels(figure).astype(int)[:, :320]
+    coloured = np.ptp(image, axis=2) > 40  # the box is grey
+    high, wide = (np.ptp(np.flatnonzero(coloured.any(axis=k))) for k in (1, 0))
+    assert (wide > 1.3 * high) if axis == "x" else (high > 1.3 * wide)
+
+
+def test_bodies_without_their_directions_are_refused(tmp_path):
+    group = "shape: spheroid, aspect_ratio: 2, material: glass, count: 8"
+    scene = SCENE.replace("material: glass, count: 8", group).replace("radius: 0.1", "radius: 0.05")
+    (tmp_path / "scene.yaml").write_text(scene)
+    arguments = ["-m", "dem_mpi", "run", tmp_path / "scene.yaml", "--out", tmp_path]
+    assert run_ranks(1, arguments, timeout=300).returncode == 0
+    done = render(tmp_path / "run.h5", "--figure", tmp_path / "none.png")
+    assert done.returncode == 65
+    assert "need shape, half_length, orientation in output.fields" in done.stderr
