@@ -16,8 +16,11 @@ import numpy as np
 from dem_mpi._jit import jit, jit_threads, prange
 from dem_mpi._kernels_shapes import pair_contacts, smallest_size, wall_contacts
 from dem_mpi._kernels_walls import may_touch, norm
-
-_V, _W, _C, _KIND = 12, 15, 18, 21  # columns of a face, after its geometry
+from dem_mpi.wall_kinds import CENTRE as _C
+from dem_mpi.wall_kinds import GEOMETRY
+from dem_mpi.wall_kinds import KIND as _KIND
+from dem_mpi.wall_kinds import SPIN as _W
+from dem_mpi.wall_kinds import VELOCITY as _V
 
 
 @jit
@@ -60,8 +63,8 @@ def _wall(x, d, form, R, v, w, a, face, k, mu, h, c, out):
     if not may_touch(face, k, x[a, 0], x[a, 1], x[a, 2], R[a], limit):
         return 0
     return wall_contacts(
-        int(face[k, _KIND]), face[k, :_V], int(form[a, 0]), x[a], d[a], form[a, 1], form[a, 2],
-        limit, out,
+        int(face[k, _KIND]), face[k, :GEOMETRY],
+        int(form[a, 0]), x[a], d[a], form[a, 1], form[a, 2], limit, out,
     )  # fmt: skip
 
 

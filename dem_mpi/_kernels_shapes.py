@@ -53,9 +53,9 @@ from dem_mpi._kernels_wall_points import (
     on_frustum,
     on_rectangle,
 )
+from dem_mpi.wall_kinds import PLANE, RECTANGLE
 
 SPHERE, SPHEROCYLINDER, SPHEROID = 0, 1, 2
-PLANE, RECTANGLE, FRUSTUM = 0, 1, 2
 
 
 # ---- sizes ---------------------------------------------------------------------------------

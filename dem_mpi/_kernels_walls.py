@@ -21,11 +21,13 @@ from __future__ import annotations
 import numpy as np
 
 from dem_mpi._jit import jit
-from dem_mpi.walls import FRUSTUM, PLANE, RECTANGLE
+from dem_mpi.wall_kinds import CENTRE as _C
+from dem_mpi.wall_kinds import FRUSTUM, PLANE, RECTANGLE
+from dem_mpi.wall_kinds import KIND as _KIND
+from dem_mpi.wall_kinds import SPIN as _W
+from dem_mpi.wall_kinds import VELOCITY as _V
 
 _ON_AXIS = 1e-12  # of the radius: closer to the axis than this, no meridian is the nearest
-# Columns of a row: geometry first (see `walls`), then velocity, spin, centre of rotation, kind.
-_V, _W, _C, _KIND = 12, 15, 18, 21
 
 
 @jit

@@ -19,7 +19,8 @@ from dem_mpi.scene_periodic import periodic_doubts, periodic_violations
 from dem_mpi.scene_walls import wall_name
 from dem_mpi.sizes import largest_reach, thinnest_half
 from dem_mpi.wall_checks import Behind, behind, top_speed
-from dem_mpi.walls import PLANE, wall_faces
+from dem_mpi.wall_kinds import PLANE
+from dem_mpi.walls import wall_faces
 from dem_mpi.yaml_reader import KeyPath
 
 # Steps are counted in float64 when times are computed from them.

@@ -13,7 +13,8 @@ from dem_mpi.scene_base import FACES
 from dem_mpi.scene_models import Scenario
 from dem_mpi.scene_walls import BoxWall, Motion, PlaneWall, RectangleWall
 from dem_mpi.sizes import largest_reach, smallest_radius
-from dem_mpi.walls import PLANE, RECTANGLE, WallFaces, wall_faces
+from dem_mpi.wall_kinds import PLANE, RECTANGLE
+from dem_mpi.walls import WallFaces, wall_faces
 from dem_mpi.yaml_reader import KeyPath
 
 _STRAIGHT = 1e-12  # component of a unit normal that counts as none

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from dem_mpi.scene_base import Vec3
 from dem_mpi.scene_walls import Motion, Rotation
-from dem_mpi.walls import FRUSTUM, PLANE, RECTANGLE, WallFaces
+from dem_mpi.wall_kinds import FRUSTUM, PLANE, RECTANGLE
+from dem_mpi.walls import WallFaces
 
 _SAMPLES = 17  # points along an edge of a region
 _LEVEL = 1e-9  # cosine to gravity below which a surface holds nothing up

@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from dem_mpi import wall_kinds
 from dem_mpi.scene_base import FACES, Vec3
 from dem_mpi.scene_models import Scenario
 from dem_mpi.scene_walls import (
@@ -28,22 +29,17 @@ from dem_mpi.scene_walls import (
     Wall,
     wall_name,
 )
+from dem_mpi.wall_kinds import ABSENT, FRUSTUM, PLANE, RECTANGLE
 
-# Kinds of surfaces and what their row of `geometry` holds.
-ABSENT = -1
-PLANE = 0  # point 0:3, unit normal 3:6 to the side of the bodies
-RECTANGLE = 1  # centre 0:3, unit normal 3:6, half edges 6:9 and 9:12
-FRUSTUM = 2  # start 0:3, unit axis 3:6, length 6, radii at start and end 7:9, side 9 (+1 inside)
 _POINTS, _DIRECTIONS = slice(0, 3), {PLANE: (3,), RECTANGLE: (3, 6, 9), FRUSTUM: (3,)}
-_GEOMETRY = 12
 
 
 @dataclass(frozen=True)
 class WallFaces:
     """All wall faces at time 0; face k is the kinematic body with id -(k + 1).
 
-    name: w strings such as "box.z_min"; kind: (w,) int8; geometry: (w, 12) float64, see the
-    constants of this module; material: (w,) int32; until: (w,) [s] when the face vanishes;
+    name: w strings such as "box.z_min"; kind: (w,) int8; geometry: (w, 12) float64, see
+    `wall_kinds`; material: (w,) int32; until: (w,) [s] when the face vanishes;
     motion: w, None where a face stands still.
     """
 
@@ -96,12 +92,17 @@ class Walls:
         return bool(self.velocity.any() or self.spin.any())
 
     def rows(self) -> NDArray:
-        """All that contact detection asks of a face in one row, (w, 22).
-
-        geometry 0:12, velocity 12:15, spin 15:18, centre 18:21, kind 21.
-        """
-        columns = (self.geometry, self.velocity, self.spin, self.centre, self.kind[:, None])
-        return np.hstack(columns).astype(np.float64, copy=False)
+        """All that contact detection asks of a face in one row, (w, 22), see `wall_kinds`."""
+        rows = np.empty((len(self.kind), wall_kinds.ROW))
+        rows[:, : wall_kinds.GEOMETRY] = self.geometry
+        for first, vector in (
+            (wall_kinds.VELOCITY, self.velocity),
+            (wall_kinds.SPIN, self.spin),
+            (wall_kinds.CENTRE, self.centre),
+        ):
+            rows[:, first : first + 3] = vector
+        rows[:, wall_kinds.KIND] = self.kind
+        return rows
 
 
 def wall_faces(scenario: Scenario) -> WallFaces:
@@ -120,7 +121,7 @@ def wall_faces(scenario: Scenario) -> WallFaces:
     return WallFaces(
         name=tuple(names),
         kind=np.array(kinds, dtype=np.int8),
-        geometry=np.array(rows, dtype=np.float64).reshape(-1, _GEOMETRY),
+        geometry=np.array(rows, dtype=np.float64).reshape(-1, wall_kinds.GEOMETRY),
         material=np.array([materials.index(wall.material) for wall in owners], dtype=np.int32),
         until=np.array([np.inf if wall.until is None else wall.until for wall in owners]),
         motion=tuple(wall.motion for wall in owners),
@@ -159,7 +160,7 @@ def _box_faces(wall: BoxWall) -> list[tuple[str, int, NDArray]]:
 
 
 def _row(*parts: ArrayLike) -> NDArray:
-    row = np.zeros(_GEOMETRY)
+    row = np.zeros(wall_kinds.GEOMETRY)
     values = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
     row[: len(values)] = values
     return row

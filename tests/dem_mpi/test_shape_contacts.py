@@ -15,9 +15,6 @@ import pytest
 from numpy.typing import NDArray
 
 from dem_mpi._kernels_shapes import (
-    FRUSTUM,
-    PLANE,
-    RECTANGLE,
     SPHERE,
     SPHEROCYLINDER,
     SPHEROID,
@@ -28,6 +25,7 @@ from dem_mpi._kernels_shapes import (
 )
 from dem_mpi._kernels_spheroids import newton_direction, spheroid_foot, spheroid_segment
 from dem_mpi._kernels_walls import sphere_wall
+from dem_mpi.wall_kinds import FRUSTUM, PLANE, RECTANGLE
 
 import shape_twins as twins
 

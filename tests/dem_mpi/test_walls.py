@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import subprocess
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -19,11 +21,8 @@ from dem_mpi.scenario import Scenario
 from dem_mpi.scene_walls import Motion
 from dem_mpi.simulation import Simulation
 from dem_mpi.state import restore, save
+from dem_mpi.wall_kinds import ABSENT, FRUSTUM, PLANE, RECTANGLE
 from dem_mpi.walls import (
-    ABSENT,
-    FRUSTUM,
-    PLANE,
-    RECTANGLE,
     Drive,
     Walls,
     rotation_matrix,
@@ -936,3 +935,14 @@ def test_estimate_knows_which_walls_hold_bodies_up(walls, holds):
     loaded = grid_scene(walls, low=(-0.1, -0.1, z), high=(0.1, 0.1, z + 0.1), count=4)
     assert estimate(loaded.scenario).settled == holds
     assert estimate(loaded.scenario).faces == len(walls)
+
+
+def test_compiled_kernels_of_walls_need_no_scene():
+    """Their modules load without pydantic, and know the kinds of walls all the same."""
+    program = (
+        "import sys, dem_mpi._kernels_narrow as k; print('pydantic' in sys.modules, k.GEOMETRY)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == ["False", "12"]

@@ -25,7 +25,8 @@ from dem_mpi.contacts import (
 )
 from dem_mpi.parallel import Parallel
 from dem_mpi.partition import Partition, balance, migrate
-from dem_mpi.walls import PLANE, Walls
+from dem_mpi.wall_kinds import PLANE
+from dem_mpi.walls import Walls
 
 CONTACT = np.dtype(
     [
