@@ -9,12 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from dem_mpi._jit import jit
+from dem_mpi._kernels_walls import may_touch, sphere_wall
 
 _LOW_HALF, _HALF = np.uint64(0xFFFFFFFF), np.uint64(32)
 _M0, _M1 = np.uint64(0xD2E7470EE14C6C93), np.uint64(0xCA5A826395121157)
 _W0, _W1 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBB67AE8584CAA73B)
 _UNIT, _SHIFT = 2.0**-53, np.uint64(11)
 _ROUNDS = 10
+_TOUCHING = 1e-9  # of a radius: to reach into a wall by less is rounding
 
 
 @jit
@@ -94,6 +96,24 @@ def find_blocked(candidate, reach, cell, strides, head, following, spheres, bloc
                 x, y, z, reach[b], 0.0, cell[b, k], strides[0], strides[1], head, following,
                 spheres,
             )  # fmt: skip
+
+
+@jit
+def block_at_walls(candidate, reach, face, blocked):
+    """Mark in blocked (b, k) uint8 the candidates (b, k, 3) that reach into a wall.
+
+    reach (b,) is that of the b bodies; face (w, 22) rows of `Walls.rows`.
+    """
+    for b in range(candidate.shape[0]):
+        limit = -_TOUCHING * reach[b]
+        for k in range(candidate.shape[1]):
+            x, y, z = candidate[b, k]
+            for f in range(face.shape[0]):
+                if blocked[b, k]:
+                    break
+                if may_touch(face, f, x, y, z, reach[b], limit):
+                    near, far = sphere_wall(face, f, x, y, z, reach[b])
+                    blocked[b, k] = near[0] < limit or far[0] < limit
 
 
 @jit

@@ -2,8 +2,9 @@
 
 Body i of a group is due at start + i / rate. Its candidates in a step are random numbers of
 (seed, group, i, step, attempt), the same on all ranks. Each rank marks those that overlap its own
-bodies, one reduction joins the marks, and then every rank picks the same places. A body that finds
-none waits for the next step, and those behind it in its group with it.
+bodies, one reduction joins the marks, every rank adds those that reach into a wall where it stands
+just then, and picks the same places. A body that finds none waits for the next step, and those
+behind it in its group with it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from dem_mpi.scene_bodies import BodyGroup, Insertion
 from dem_mpi.sizes import smallest_radius, thinnest_half
 from dem_mpi.sphere_cells import CellGrid, LinkedSpheres
 from dem_mpi.state import State
+from dem_mpi.walls import Walls
 
 _ATTEMPTS = 32  # candidates of a body in a step
 _DENSEST = 0.75  # volume fraction that no packing reaches: more bodies need not be tried at once
@@ -91,11 +93,17 @@ def reserved_gids(scenario: Scenario) -> list[int]:
 
 
 def arrive(
-    parallel: Parallel, scenario: Scenario, reserved: list[int], state: State, time: float
+    parallel: Parallel,
+    scenario: Scenario,
+    reserved: list[int],
+    state: State,
+    walls: Walls,
+    time: float,
 ) -> Arrivals:
     """Collective. Find places for the bodies that are due at `time` [s]; `state` stays as it is.
 
-    Without anybody due nothing is sent. `reserved` comes from `reserved_gids`.
+    Without anybody due nothing is sent. `reserved` comes from `reserved_gids`; `walls` are those
+    of that time.
     """
     inserted = _counters(state.inserted, len(scenario.bodies))
     pending = [
@@ -105,7 +113,7 @@ def arrive(
     queues = [_queue(scenario, n, int(inserted[n]), p) for n, p in enumerate(pending) if p > 0]
     if not queues:
         return Arrivals(Bodies.empty(), inserted, 0, False)
-    place = _find_places(parallel, scenario, state, queues)
+    place = _find_places(parallel, scenario, state, walls, queues)
     parts = []
     for queue, position in zip(queues, place, strict=True):
         found = len(position)
@@ -152,7 +160,7 @@ def _queue(scenario: Scenario, number: int, first: int, pending: int) -> _Queue:
 
 
 def _find_places(
-    parallel: Parallel, scenario: Scenario, state: State, queues: list[_Queue]
+    parallel: Parallel, scenario: Scenario, state: State, walls: Walls, queues: list[_Queue]
 ) -> list[NDArray]:
     """Collective. Positions (k, 3) [m] of the first k bodies of each queue that found a place."""
     candidate = np.concatenate([_candidates(scenario, queue, state.step) for queue in queues])
@@ -171,6 +179,7 @@ def _find_places(
     lists = (near.strides, near.head, near.following, near.spheres)
     kernels.find_blocked(candidate, reach, near.cell(coordinate), *lists, blocked)
     parallel.max_in_place(blocked)
+    kernels.block_at_walls(candidate, reach, walls.rows(), blocked)
 
     # The lists of accepted bodies must be the same on all ranks; answers do not depend on cells.
     grid = CellGrid.covering(low, high, 2.0 * largest, most=8.0 * len(reach))

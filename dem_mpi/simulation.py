@@ -395,7 +395,10 @@ class Simulation:
         if not self.expected:
             return 0
         with self.timer.phase("partition"):
-            arrivals = insertion.arrive(self.parallel, self.scenario, self._reserved, state, time)
+            walls = walls_at(self._faces, time, self.scenario.time.step)
+            arrivals = insertion.arrive(
+                self.parallel, self.scenario, self._reserved, state, walls, time
+            )
             arrived = int(arrivals.inserted.sum() - state.inserted.sum())
             state.inserted = arrivals.inserted
             if arrived:

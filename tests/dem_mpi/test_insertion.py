@@ -157,6 +157,43 @@ def test_bodies_wait_while_the_region_is_blocked_and_come_in_when_it_is_free():
 
 
 @pytest.mark.mpi(ranks=[1, 2])
+def test_no_body_comes_in_where_a_wall_stands_at_that_time(parallel):
+    """A plate sinks through the region at 5 m/s: bodies come in above and below, clear of it."""
+    plate = {
+        "shape": "rectangle",
+        "material": "m",
+        "corner": [-1, -1, 0.82],
+        "edges": [[3, 0, 0], [0, 3, 0]],
+        "motion": {"velocity": [0, 0, -5]},
+    }
+    group = inlet(60, 1000, velocity=[0, 0, 0])
+    scenario = scene(step=STEP, gravity=(0, 0, 0), bodies=[group], walls=[plate])
+    simulation = started(parallel, scenario)
+    before: set[int] = set()
+    sides = set()
+    for step in range(30):
+        height = 0.82 - 5 * step * STEP
+        simulation._let_in(step * STEP)  # as a step does first
+        bodies = everybody(parallel, simulation.state)
+        new = bodies.position[~np.isin(bodies.gid, list(before)), 2] - height
+        assert (np.abs(new) >= 0.02 - 1e-9).all()
+        if 0.55 < height < 0.75:
+            sides |= set(np.sign(new))
+        before = set(bodies.gid.tolist())
+        simulation.step()
+    assert sides == {-1.0, 1.0}
+    assert len(before) > 25
+
+
+def test_an_inlet_as_wide_as_the_tube_around_it_still_lets_bodies_in():
+    """Bodies that touch two walls at once are not held back by rounding."""
+    group = inlet(1, 1000, region={"min": [0.1, 0.1, 0.5], "max": [0.14, 0.14, 0.8]})
+    box = {"shape": "box", "material": "m", "min": [0.1, 0.1, 0], "max": [0.14, 0.14, 1]}
+    scenario = scene(step=STEP, gravity=(0, 0, 0), bodies=[group], walls=[box])
+    assert started(Parallel.alone(), scenario).step().bodies == 1
+
+
+@pytest.mark.mpi(ranks=[1, 2])
 def test_a_body_across_a_periodic_face_blocks_the_other_side(parallel):
     """The ball stands at x = 0.95 of a period of 1; its image at x = -0.05 fills the region."""
     group = inlet(2, 1000, velocity=[0, 0, 0], region={"min": [0, 0, 0], "max": [0.1, 0.1, 0.1]})
