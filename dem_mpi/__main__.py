@@ -201,7 +201,7 @@ def solve(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace FILE.h5 if it exists.")] = False,
 ) -> None:
-    """Solve a contact problem of the FCLIB collection: mpirun -n P dem-mpi solve PROBLEM.h5.
+    """Solve an FCLIB problem: mpirun -n P dem-mpi solve PROBLEM.h5.
 
     PROBLEM.h5 is local (W, q, mu) or global (M, H, f, w, mu). Prints iterations, residuals,
     objective and seconds, and how stored impulses compare. Ends with 0 if the tolerance holds and

@@ -50,13 +50,17 @@ def finished(tmp_path_factory) -> Path:
 # ---- help and usage ---------------------------------------------------------------------------
 
 VERBS = {
-    "": ("--version", "run", "check", "schema", "info", "warmup"),
+    "": ("--version", "run", "check", "schema", "info", "solve", "warmup"),
     "run": ("SCENE", "--resume", "--out DIR", "--set KEY.PATH=VALUE", "--force"),
     "check": ("SCENE", "--set KEY.PATH=VALUE", "--ranks"),
     "schema": (),
     "info": ("FILE.h5",),
+    "solve": (
+        "PROBLEM.h5", "--tolerance", "--tolerance-kind", "--complementarity", "--max-iterations",
+        "--guess", "--out FILE.h5", "--force",
+    ),
     "warmup": ("--threads",),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("verb", VERBS)
