@@ -10,6 +10,7 @@ behind it in its group with it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,6 +91,24 @@ def reserved_gids(scenario: Scenario) -> list[int]:
     if not any(is_inlet(group) for group in scenario.bodies):
         return []
     return first_gids(group_counts(scenario))
+
+
+def changed_count(scenario: Scenario, stored: Sequence[int]) -> str:
+    """Say which group no longer has the count by which gids were reserved, '' for none.
+
+    stored : the counts of the scene that a run began with. Groups added behind them do no harm.
+    """
+    if not any(is_inlet(group) for group in scenario.bodies):
+        return ""
+    counts = group_counts(scenario)
+    for number, before in enumerate(stored):
+        if number >= len(counts):
+            return f"bodies[{number}], of {before} bodies, is gone"
+        if counts[number] != before:
+            placement = scenario.bodies[number].placement
+            file = f" of {placement.path}" if placement.file is not None else ""
+            return f"bodies[{number}] has {counts[number]} bodies{file}, and had {before}"
+    return ""
 
 
 def arrive(

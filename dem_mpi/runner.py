@@ -16,6 +16,7 @@ from dem_mpi.bodies import FIELDS, Bodies
 from dem_mpi.errors import DemError, InputError, StoppedError
 from dem_mpi.estimate import checkpoint_bytes
 from dem_mpi.h5files import OutputLock, require_space
+from dem_mpi.insertion import changed_count
 from dem_mpi.metrics import PHASES, MetricsLog, Progress, closing_table, resident_memory
 from dem_mpi.output import Field, Series, Trajectory, describe, frame_bytes
 from dem_mpi.parallel import Parallel
@@ -170,6 +171,13 @@ class Run:
             )
 
     def _compare_scene(self, stored: dict[str, Any], path: Path, force: bool) -> None:
+        """Raise if the scene has changed, and is not meant to or cannot be resumed any more."""
+        changed = changed_count(self._scenario, [group["count"] for group in stored["bodies"]])
+        if changed:
+            raise InputError(
+                f"{self._loaded.path}: {changed} when {path.name} was written; bodies that come in "
+                f"would take the gids of others. Take the change back, or add groups at the end"
+            )
         changes = difference(stored, self._loaded.effective)
         if not changes:
             return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -267,6 +268,39 @@ def test_a_run_stopped_while_bodies_come_and_go_equals_the_uninterrupted_one(par
         assert lines[0]["bodies"] == 0
         assert 0 < lines[-1]["removed"] < 40
     parallel.barrier()
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_resume_is_refused_where_gids_would_be_given_twice(tmp_path: Path, force: bool):
+    """The inlet's gids begin behind the two of the file, which has three when the run goes on."""
+    file = tmp_path / "some.csv"
+    file.write_text("x,y,z\n-0.6,0,0.5\n-0.8,0,0.5\n")
+    group = f"- {{material: glass, radius: 0.05, placement: {{file: {file}}}}}"
+    text = INLET.replace("bodies:\n", f"bodies:\n  {group}\n")
+    simulate(Parallel.alone(), text, tmp_path / "out", "time.end=0.02", steps=5)
+    file.write_text(file.read_text() + "-0.4,0,0.5\n")
+    with pytest.raises(InputError) as refused:
+        simulate(
+            Parallel.alone(), text, tmp_path / "out", "time.end=0.02", resume=True, force=force
+        )
+    assert f"bodies[0] has 3 bodies of {file}, and had 2" in str(refused.value)
+    assert "run.checkpoint.000000005.h5" in str(refused.value)
+    kept = ("time.end=0.02", "bodies.0.count=2")
+    simulate(Parallel.alone(), text, tmp_path / "out", *kept, resume=True)
+    assert metrics(tmp_path / "out")[-1]["step"] == 10
+
+
+def test_an_inlet_may_be_added_to_a_run_behind_the_others(tmp_path: Path):
+    end = "time.end=0.02"
+    simulate(Parallel.alone(), INLET, tmp_path, end, steps=5)
+    group = INLET.split("bodies:\n")[1].split("walls:")[0]
+    longer = INLET.replace("count: 40", "count: 41")
+    with pytest.raises(InputError, match=re.escape("bodies[0] has 41 bodies, and had 40")):
+        simulate(Parallel.alone(), longer, tmp_path, end, resume=True, force=True)
+    both = INLET.replace("walls:", group + "walls:")
+    simulate(Parallel.alone(), both, tmp_path, end, resume=True, force=True)
+    last = metrics(tmp_path)[-1]
+    assert last["bodies"] + last["removed"] > 14  # one inlet alone has let in 14 by then
 
 
 def test_the_report_says_who_came_who_waits_and_who_left_where(tmp_path: Path, capsys):
