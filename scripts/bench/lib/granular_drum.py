@@ -98,7 +98,7 @@ def overrides(mu: float, rate: float, count: int, end: float) -> dict[str, Any]:
 
 def study(quick: bool) -> tuple[list[Record], list[dict[str, Any]]]:
     """Run the drum at several frictions and speeds; return records, and rows for `draw`."""
-    count, end = (300, 2.0) if quick else (1000, END)
+    count, end = (500, 2.0) if quick else (1000, END)
     records, rows = [], []
     for mu, rate in CASES[:3] if quick else CASES:
         found = steady(run("drum", overrides(mu, rate, count, end)), START)
