@@ -1,8 +1,9 @@
 """Initial bodies from a CSV or HDF5 file, a range of rows at a time.
 
-CSV: one header line naming the columns x,y,z[,radius][,vx,vy,vz][,wx,wy,wz] in any order.
-HDF5: a group with the data sets position (n, 3)[, radius (n), velocity (n, 3),
-angular_velocity (n, 3)]. A file that is damaged or that points out of itself raises DataError.
+CSV: one header line naming the columns x,y,z[,radius][,vx,vy,vz][,wx,wy,wz][,qw,qx,qy,qz] in any
+order. HDF5: a group with the data sets position (n, 3)[, radius (n), velocity (n, 3),
+angular_velocity (n, 3), orientation (n, 4)]. Orientations are quaternions, the scalar first. A file
+that is damaged or that points out of itself raises DataError.
 """
 
 from __future__ import annotations
@@ -29,7 +30,10 @@ COLUMNS = {
     "radius": ("radius",),
     "velocity": ("vx", "vy", "vz"),
     "angular_velocity": ("wx", "wy", "wz"),
+    "orientation": ("qw", "qx", "qy", "qz"),
 }
+# The squared length of a quaternion that stands for a direction at all; it is then made 1.
+_SHORTEST, _LONGEST = 1e-12, 1e12
 
 
 class BodyFile:
@@ -56,17 +60,17 @@ class BodyFile:
     def read(self, start: int, stop: int) -> dict[str, np.ndarray]:
         """Bodies start <= row < stop: position (n, 3) [m] and what else the file has, float64.
 
-        Raises DataError for rows that are no finite numbers and for radii that are not positive.
+        Orientations (n, 4) are of length 1. Raises DataError for rows that are no finite numbers,
+        for radii that are not positive and for quaternions that are (nearly) zero.
         """
         arrays = self._csv_rows(start, stop) if self.is_csv else self._hdf5_rows(start, stop)
         for name, array in arrays.items():
-            good = np.isfinite(array).reshape(len(array), -1).all(axis=1)
-            if name == "radius":
-                good &= array > 0
+            good, rule = _good(name, array)
             if not good.all():
                 row = start + int(np.argmin(good))
-                rule = "must be finite and > 0" if name == "radius" else "must be finite"
                 raise DataError(f"{self.path}: body {row} (from 0): {name} {rule}")
+        if "orientation" in arrays:
+            arrays["orientation"] /= np.linalg.norm(arrays["orientation"], axis=1, keepdims=True)
         return arrays
 
     def _csv_rows(self, start: int, stop: int) -> dict[str, np.ndarray]:
@@ -108,6 +112,18 @@ class BodyFile:
                 return {q: group[q][start:stop].astype(np.float64) for q in self.quantities}
         except (OSError, KeyError, RuntimeError) as error:
             raise DataError(f"{self.path}: cannot be read: {_short(error)}") from None
+
+
+def _good(name: str, array: np.ndarray) -> tuple[np.ndarray, str]:
+    """Which rows (n,) of a quantity can be used, and what the others break."""
+    finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
+    if name == "radius":
+        return finite & (array > 0), "must be finite and > 0"
+    if name == "orientation":
+        with np.errstate(over="ignore", invalid="ignore"):
+            square = np.sum(array**2, axis=1)
+        return finite & (square > _SHORTEST) & (square < _LONGEST), "must be a quaternion, not 0"
+    return finite, "must be finite"
 
 
 def _csv_body_lines(file: TextIO, start: int, stop: int) -> Iterator[str]:
@@ -198,7 +214,8 @@ def _rows(path: Path, group: h5py.Group, quantity: str) -> int:
     shape = data.shape
     width = len(COLUMNS[quantity])
     if shape is None or shape[1:] != ((width,) if width > 1 else ()) or len(shape) < 1:
-        raise DataError(f"{where} has shape {shape}; expected (n{', 3' if width > 1 else ''})")
+        expected = f"(n, {width})" if width > 1 else "(n)"
+        raise DataError(f"{where} has shape {shape}; expected {expected}")
     if data.size * data.dtype.itemsize > MAX_COMPRESSION * max(data.id.get_storage_size(), 1):
         raise DataError(f"{where} claims shape {shape}, but the file does not hold that much data")
     return shape[0]

@@ -201,15 +201,15 @@ class Placement(Model):
         "A region where bodies come in during the run; no new body reaches out of it", default=None
     )
     file: str | None = note(
-        "CSV (header x,y,z[,radius][,vx,vy,vz][,wx,wy,wz]) or HDF5 file (.h5, .hdf5) relative to "
-        "the scene; what it states replaces the group's radius and velocities",
+        "CSV (header x,y,z[,radius][,vx,vy,vz][,wx,wy,wz][,qw,qx,qy,qz]) or HDF5 file (.h5, .hdf5) "
+        "relative to the scene; what it states replaces the group's radius, velocities and axis",
         default=None,
         min_length=1,
         max_length=4096,
     )
     dataset: str | None = note(
-        "HDF5 group holding position (n,3)[, radius (n), velocity (n,3), angular_velocity (n,3)]; "
-        "by default the file's root",
+        "HDF5 group holding position (n,3)[, radius (n), velocity (n,3), angular_velocity (n,3), "
+        "orientation (n,4) body to world, scalar first]; by default the file's root",
         default=None,
         min_length=1,
         max_length=1024,

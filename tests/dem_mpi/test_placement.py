@@ -248,6 +248,27 @@ def test_csv_columns_may_stand_in_any_order_and_replace_the_scene_s_values(tmp_p
 
 
 @pytest.mark.parametrize("kind", ["csv", "h5"])
+def test_a_bed_of_rods_stands_as_it_was_when_it_is_read_again(tmp_path: Path, kind: str):
+    """Position, radius and orientation to the last bit but one; the scene gives the shape."""
+    rods = place_share(scenario(RODS.replace("AXIS", "random").replace("4000", "200")), 0, 1)
+    stretch = np.random.default_rng(1).uniform(0.5, 2, (200, 1))  # lengths are made 1 again
+    table = [rods["position"], rods["radius"][:, None], stretch * rods["orientation"]]
+    if kind == "csv":
+        header = "x,y,z,radius,qw,qx,qy,qz"
+        np.savetxt(tmp_path / "b.csv", np.hstack(table), "%.17g", ",", header=header, comments="")
+    else:
+        with h5py.File(tmp_path / "b.h5", "w") as file:
+            file["position"], file["radius"] = rods["position"], rods["radius"]
+            file["orientation"] = table[2]
+    shape = "shape: spherocylinder, aspect_ratio: 2.5, "
+    scene = load_scenario(file_scene(tmp_path, f"b.{kind}", shape)).scenario
+    again = place_share(scene, 0, 1)
+    for key in ("position", "radius", "half_length", "shape"):
+        assert again[key].tobytes() == rods[key].tobytes(), key
+    np.testing.assert_allclose(again["orientation"], rods["orientation"], rtol=0, atol=4e-16)
+
+
+@pytest.mark.parametrize("kind", ["csv", "h5"])
 def test_ranks_read_their_own_rows(tmp_path: Path, kind: str):
     position = np.random.default_rng(0).random((101, 3))
     if kind == "csv":
@@ -292,6 +313,9 @@ def test_radius_must_come_from_somewhere(tmp_path: Path):
         ("x,y,z\n1,2,3\n1,2,three\n", r"body 1 \(from 0\): '1,2,three' is not 3 numbers"),
         ("x,y,z\n1,2,3\n1,nan,3\n", r"body 1 \(from 0\): position must be finite"),
         ("x,y,z,radius\n1,2,3,1\n1,2,3,-1\n", r"body 1 \(from 0\): radius must be finite and > 0"),
+        ("x,y,z,qw,qx,qy\n1,2,3,1,0,0\n", "column qz is missing"),
+        ("x,y,z,qw,qx,qy,qz\n1,2,3,0,0,0,0\n", r"body 0 \(from 0\): orientation must be a quat"),
+        ("x,y,z,qw,qx,qy,qz\n1,2,3,1,0,nan,0\n", r"body 0 \(from 0\): orientation must be a quat"),
         (b"x,y,z\n\xff\xfe,1,2\n", "not UTF-8"),
         (b"\x89HDF\r\n\x1a\n", "not UTF-8"),
     ],
@@ -348,6 +372,16 @@ def _wrong_width(file: h5py.File) -> None:
     file["position"] = np.zeros((4, 2))
 
 
+def _orientation_without_scalar(file: h5py.File) -> None:
+    _plain(file)
+    file["orientation"] = np.ones((4, 3))
+
+
+def _no_direction(file: h5py.File) -> None:
+    _plain(file)
+    file["orientation"] = np.array([[1.0, 0, 0, 0], [1e-9, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]])
+
+
 def _scalar(file: h5py.File) -> None:
     file["position"] = 1.0
 
@@ -376,6 +410,8 @@ def _not_finite(file: h5py.File) -> None:
         (_absurd_shape, "does not hold that much data"),
         (_objects, "numbers are expected"),
         (_wrong_width, "has shape"),
+        (_orientation_without_scalar, r"has shape \(4, 3\); expected \(n, 4\)"),
+        (_no_direction, r"body 1 \(from 0\): orientation must be a quaternion"),
         (_scalar, "has shape"),
         (_group_instead, "is no dataset"),
         (_lengths_differ, "differ in length"),
