@@ -197,16 +197,23 @@ def _shared_space(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Fi
 def _speed_doubts(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Finding]:
     """Bodies or walls that cross a radius within one step, so that contacts come too late."""
     step = scenario.time.step
-    radii = [thinnest_half(group) for group in scenario.bodies if group.radius is not None]
+    radii = [_resolved_travel(group) for group in scenario.bodies if group.radius is not None]
     for index, group in enumerate(scenario.bodies):
         if group.radius is None:
             continue
-        radius = thinnest_half(group)
+        travel, radius = _resolved_travel(group), thinnest_half(group)
         speed = _speed_reached(scenario, group, extents.get(index))
-        if speed * step > radius:
+        if travel == radius and speed * step > radius:
             rule = (
                 f"bodies[{index}] may reach {speed:.3g} m/s and cross its radius of {radius:g} m "
                 f"within a step; {radius / speed:.2g} s would resolve it"
+            )
+            yield Finding(("time", "step"), rule)
+        elif travel < radius and speed * step > travel:
+            rule = (
+                f"bodies[{index}] may hit at {speed:.3g} m/s and turn so far in a step that they "
+                f"overlap by half of their half width of {radius:g} m, where runs end; "
+                f"{0.5 * travel / speed:.2g} s would resolve it"
             )
             yield Finding(("time", "step"), rule)
     faces = wall_faces(scenario)
@@ -220,9 +227,30 @@ def _speed_doubts(scenario: Scenario, extents: dict[int, Extent]) -> Iterator[Fi
             yield Finding(("walls", index, "motion"), rule)
 
 
+def _resolved_travel(group: BodyGroup) -> float:
+    """How far [m] a body of a group may move in a step before overlaps run away.
+
+    A sphere's or a rod's radius. A flat or slender spheroid turns when it is hit, about a contact
+    that is found once a step, and sinks in by R (angle)^2 / 2 with the radius of curvature
+    R = l^2 / s of semi-axes s < l: the largest overlaps of 120 that hit a plane at v with random
+    directions were 2.4 (1 - s/l)^4 (v h / s)^2 s, within an eighth, for s/l from 0.1 to 0.5. Runs
+    end at overlaps of s / 2.
+    """
+    half = thinnest_half(group)
+    ratio = (group.aspect_ratio or 1.0) if group.shape == "spheroid" else 1.0
+    slender = 1.0 - min(ratio, 1.0 / ratio)
+    return half / max(1.0, math.sqrt(2.4 / 0.5) * slender**2)
+
+
 def _speed_reached(scenario: Scenario, group: BodyGroup, extent: Extent | None) -> float:
-    """Upper estimate of a group's speed [m/s] after falling to the floor or to the end of time."""
+    """Upper estimate of a group's speed [m/s] after falling to the floor or to the end of time.
+
+    Of a spheroid that turns at w, half the speed of its ends counts: an impact makes it turn as
+    fast as twice its speed allows at the ends.
+    """
     speed = math.hypot(*group.velocity) + math.sqrt(3) * group.velocity_jitter
+    if group.shape == "spheroid":
+        speed += 0.5 * math.hypot(*group.angular_velocity) * largest_reach(group)
     gravity = math.hypot(*scenario.gravity)
     if gravity == 0:
         return speed

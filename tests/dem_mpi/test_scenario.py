@@ -6,6 +6,7 @@ import json
 import math
 import pickle
 import random
+import re
 import time
 from pathlib import Path
 
@@ -366,6 +367,36 @@ def test_doubtful_but_legal_scene_warns(override: str, words: str):
     assert parse_scenario(SCENE, "s").warnings == ()
     (warning,) = parse_scenario(SCENE, "s", [override]).warnings
     assert words in warning
+
+
+FALLING_DISC = """
+domain: {min: [-1, -1, -1], max: [1, 1, 1]}
+gravity: [0, 0, 0]
+materials: {glass: {density: 2500}}
+bodies:
+  - {material: glass, shape: spheroid, aspect_ratio: 0.1, count: 1, radius: 0.03,
+     velocity: [0, 0, -2], placement: {jittered_grid: {min: [0, 0, 0.1], max: [0.1, 0.1, 0.2]}}}
+time: {step: 1e-3, end: 1}
+"""
+
+
+def test_a_step_in_which_flat_or_slender_bodies_turn_too_far_warns():
+    """A half width of 3 mm: 2 mm a step are too many, 1 mm or a rounder body are not."""
+    (warning,) = parse_scenario(FALLING_DISC, "s").warnings
+    assert "time.step" in warning and "half width of 0.003 m" in warning
+    named = re.search(r"([0-9.e-]+) s would resolve it", warning)[1]
+    for overrides in (
+        [f"time.step={named}", f"time.end={1000 * float(named)}"],
+        ["bodies.0.velocity=[0, 0, -1]"],
+        ["bodies.0.aspect_ratio=0.5"],
+        ["bodies.0.shape=spherocylinder", "bodies.0.aspect_ratio=3", "bodies.0.radius=0.003"],
+    ):
+        assert parse_scenario(FALLING_DISC, "s", overrides).warnings == ()
+    needle = ["bodies.0.aspect_ratio=10", "bodies.0.radius=3e-3"]
+    turning = ["bodies.0.velocity=[0, 0, 0]", "bodies.0.angular_velocity=[200, 0, 0]"]
+    for overrides in (needle, turning):
+        (warning,) = parse_scenario(FALLING_DISC, "s", overrides).warnings
+        assert "half width of 0.003 m" in warning
 
 
 def test_grids_that_share_space_warn():
