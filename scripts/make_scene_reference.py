@@ -9,6 +9,7 @@ With --check nothing is written; the exit code is 1 if the file is out of date.
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,9 @@ This page is made from the schema by `scripts/make_scene_reference.py`.
 """
 
 Schema = dict[str, Any]
+
+# Names a choice of sections in a heading, but is no part of the path to a key in it.
+_CHOICE = re.compile(r"\[[a-z_]+\]$")
 
 
 def main() -> int:
@@ -74,7 +78,7 @@ def _add_section(
         inner += [(key + suffix, found) for suffix, found in sections]
     parts.append("")
     for key, found in inner:
-        inside = key if path == "The file" else f"{path}.{key}"
+        inside = key if path == "The file" else f"{_CHOICE.sub('', path)}.{key}"
         if found["title"] in done:
             parts.append(f"## `{inside}`\n\nThe keys of `{done[found['title']]}`.\n")
             continue
@@ -97,7 +101,11 @@ def _sections_of(entry: Schema, schema: Schema) -> list[tuple[str, Schema]]:
         # Sections to choose from have a key that names the choice.
         return [("[]" if len(found) == 1 else f"[shape={_shape(s)}]", s) for _, s in found]
     choices = entry.get("anyOf") or entry.get("oneOf") or []
-    return [found for choice in choices for found in _sections_of(choice, schema)]
+    found = [section for choice in choices for section in _sections_of(choice, schema)]
+    if len(found) > 1 and all(suffix == "" and len(s["properties"]) == 1 for suffix, s in found):
+        # Sections to choose from that hold one key each are named by it.
+        return [(f"[{next(iter(s['properties']))}]", s) for _, s in found]
+    return found
 
 
 def _shape(section: Schema) -> str:
@@ -124,7 +132,8 @@ def _value(entry: Schema, schema: Schema) -> str:
     kind = entry.get("type")
     if kind == "array":
         if "prefixItems" in entry:
-            return f"{len(entry['prefixItems'])} {_plural(entry['prefixItems'][0])}"
+            first = entry["prefixItems"][0]
+            return f"{len(entry['prefixItems'])} {_plural(first, _value(first, schema))}"
         return "list of " + _plural(entry["items"], _value(entry["items"], schema))
     if kind == "object":
         return "sections by name"
@@ -137,6 +146,8 @@ def _plural(entry: Schema, value: str = "") -> str:
         return f"numbers{_bounds(entry)}"
     if entry.get("type") == "string" and "enum" not in entry:
         return "texts"
+    if "prefixItems" in entry:
+        return f"lists of {value}"
     return "sections" if value in ("section", "") or " or " in value else value
 
 

@@ -82,6 +82,18 @@ def test_scene_reference_is_up_to_date():
     assert done.returncode == 0, done.stderr
 
 
+def test_headings_of_the_scene_reference_are_told_apart():
+    text = page("scenes.md")
+    headings = re.findall(r"^## (.*)$", text, re.MULTILINE)
+    assert len(headings) == len(set(headings))
+    choices = [heading for heading in headings if heading.startswith("`bodies[].radius[")]
+    assert choices == [
+        f"`bodies[].radius[{c}]`" for c in ("uniform", "lognormal", "weighted", "mix")
+    ]
+    assert "`bodies[].radius.lognormal`" in headings
+    assert re.search(r"\| `edges` \| 2 lists of 3 numbers \| m \|", text)
+
+
 def test_links_between_pages_lead_somewhere():
     for path in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
         for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", path.read_text()):
