@@ -27,8 +27,7 @@ from dem_mpi.bodies import FIELDS
 from dem_mpi.scenario import Scenario, body_count, friction_table, frictional
 from dem_mpi.scene_models import only_spheres
 from dem_mpi.scene_walls import BoxWall
-from dem_mpi.shapes import sphere_volume
-from dem_mpi.sizes import largest_radius, smallest_radius
+from dem_mpi.sizes import mean_radius, mean_volume
 from dem_mpi.wall_checks import holds
 from dem_mpi.walls import wall_faces
 
@@ -152,10 +151,9 @@ def _layers(scenario: Scenario) -> float | None:
     for group in scenario.bodies:
         if group.radius is None:
             return None
-        radius = 0.5 * (smallest_radius(group) + largest_radius(group))
         count = group.count or 0
-        volume += count * float(sphere_volume(np.array(radius)))
-        diameters += count * 2.0 * radius
+        volume += count * mean_volume(group)
+        diameters += count * 2.0 * mean_radius(group)
     depth = volume / _PACKING_FRACTION / float(extent.prod())
     return depth * body_count(scenario) / diameters
 

@@ -110,6 +110,17 @@ def test_bodies_alone_on_a_floor_have_one_contact_each():
     assert spread.contacts == pytest.approx(200, rel=0.05)
 
 
+def test_the_depth_of_a_bed_is_that_of_its_mean_body():
+    """Large ones among a thousand add nothing to a bed 0.8 layers deep, where layers matter."""
+    text = BED.format(height=0.5).replace("0.25, 0.25", "0.6, 0.6")
+    few = "radius: {weighted: {radii: [0.02, 0.04], weights: [1, 1.0e-9]}}"
+    one, deep = estimate_of(text).contacts, estimate_of(BED.format(height=0.5)).contacts
+    assert one < 0.8 * deep
+    assert estimate_of(text.replace("radius: 0.02", few)).contacts == one
+    rods = text.replace("radius: 0.02", "shape: spherocylinder, aspect_ratio: 2, radius: 0.02")
+    assert one < estimate_of(rods).contacts < deep
+
+
 def test_bodies_without_gravity_or_floor_do_not_settle():
     text = BED.format(height=0.5)
     assert estimate_of(text).settled
