@@ -49,7 +49,7 @@ _RUNAWAY_OVERLAP = 0.5  # radii of the smaller body
 
 
 class SolverFailureError(DemError):
-    """The run cannot go on from this step; the state before the step is kept as it was.
+    """The run cannot go on from this step; the state before the step is kept, see `step`.
 
     `intact` tells whether that state is worth a checkpoint.
     """
@@ -181,9 +181,10 @@ class Simulation:
     def step(self) -> StepRecord:
         """Collective. Advance by one time step and return what it did.
 
-        Raises SolverFailureError on all ranks, with the state as it was before the step, if a
-        value is not a number, an overlap runs away, or the solver misses its tolerance by more
-        than the scene allows.
+        Raises SolverFailureError on all ranks if a value is not a number, an overlap runs away, or
+        the solver misses its tolerance by more than the scene allows. Then no body has moved, and
+        time and impulses are those before the step; bodies that were due at its beginning have
+        come in, and are counted: a checkpoint of that state goes on without inserting them again.
         """
         state, h = self.state, self.scenario.time.step
         self._rebuilt, self._moved = False, 0

@@ -14,10 +14,10 @@ from dem_mpi.bodies import Bodies
 from dem_mpi.errors import InputError
 from dem_mpi.parallel import Parallel
 from dem_mpi.scenario import Scenario
-from dem_mpi.simulation import Simulation, StepRecord
+from dem_mpi.simulation import Simulation, SolverFailureError, StepRecord
 
 from runs import differences, metrics, simulate
-from scenes import everybody, load, placed, scene, simulation_of
+from scenes import everybody, load, make_fail, placed, scene, simulation_of
 
 STEP = 2e-3
 REGION = {"min": [0, 0, 0.5], "max": [0.3, 0.25, 0.8]}
@@ -155,6 +155,23 @@ def test_bodies_wait_while_the_region_is_blocked_and_come_in_when_it_is_free():
         record = simulation.step()
         assert least_gap(simulation.state.bodies) > -1e-15
     assert (record.waiting, record.bodies) == (0, 6)
+
+
+def test_what_came_in_before_a_refused_step_stays_and_comes_in_only_once():
+    group = inlet(1, 1e4, velocity=[0, 0, -1])
+    stop = {"on_failure": "stop"}
+    scenario = scene(step=STEP, gravity=(0, 0, 0), bodies=[group], contact=stop)
+    simulation = started(Parallel.alone(), scenario)
+    make_fail(simulation, 1, dual=1.0)
+    with pytest.raises(SolverFailureError):
+        simulation.step()
+    state = simulation.state
+    assert (state.step, state.bodies.gid.tolist(), state.inserted.tolist()) == (0, [0], [1])
+    before = state.bodies.position.copy()
+    record = simulation.step()
+    assert (record.step, record.bodies, simulation.expected) == (1, 1, 0)
+    moved = state.bodies.position - before
+    np.testing.assert_allclose(moved, [[0, 0, -STEP]], atol=1e-15)
 
 
 @pytest.mark.mpi(ranks=[1, 2])
