@@ -2,8 +2,9 @@
 
 CSV: one header line naming the columns x,y,z[,radius][,vx,vy,vz][,wx,wy,wz][,qw,qx,qy,qz] in any
 order. HDF5: a group with the data sets position (n, 3)[, radius (n), velocity (n, 3),
-angular_velocity (n, 3), orientation (n, 4)]. Orientations are quaternions, the scalar first. A file
-that is damaged or that points out of itself raises DataError.
+angular_velocity (n, 3), orientation (n, 4)]. Orientations are quaternions, the scalar first. Of the
+trajectory of a run it is the last frame. A file that is damaged or that points out of itself raises
+DataError.
 """
 
 from __future__ import annotations
@@ -49,11 +50,12 @@ class BodyFile:
         if not path.is_file():
             raise DataError(f"{path}: no such file")
         self.columns: list[str] = []
+        self._first = 0  # row of the data sets
         if self.is_csv:
             self.columns, self.rows = _csv_form(path)
             self.quantities = tuple(q for q, names in COLUMNS.items() if names[0] in self.columns)
         else:
-            self.rows, self.quantities = _hdf5_form(path, dataset)
+            self._first, self.rows, self.quantities = _hdf5_form(path, dataset)
         if self.rows > MAX_ROWS:
             raise DataError(f"{path}: claims {self.rows} bodies; more than {MAX_ROWS} is refused")
 
@@ -109,7 +111,8 @@ class BodyFile:
         try:
             with h5py.File(self.path, "r") as file:
                 group = file[self.dataset or "/"]
-                return {q: group[q][start:stop].astype(np.float64) for q in self.quantities}
+                rows = slice(self._first + start, self._first + stop)
+                return {q: group[q][rows].astype(np.float64) for q in self.quantities}
         except (OSError, KeyError, RuntimeError) as error:
             raise DataError(f"{self.path}: cannot be read: {_short(error)}") from None
 
@@ -166,8 +169,11 @@ def _csv_form(path: Path) -> tuple[list[str], int]:
     return columns, rows
 
 
-def _hdf5_form(path: Path, dataset: str | None) -> tuple[int, tuple[str, ...]]:
-    """Number of rows and the quantities of an HDF5 file; refuses links, objects, forged shapes."""
+def _hdf5_form(path: Path, dataset: str | None) -> tuple[int, int, tuple[str, ...]]:
+    """First row, number of rows and quantities of an HDF5 file.
+
+    Refuses links, objects and forged shapes.
+    """
     import h5py
 
     try:
@@ -179,11 +185,35 @@ def _hdf5_form(path: Path, dataset: str | None) -> tuple[int, tuple[str, ...]]:
             if "position" not in quantities:
                 raise DataError(f"{path}: {group.name} has no data set 'position'")
             rows = {_rows(path, group, quantity) for quantity in quantities}
-            if len(rows) > 1:
+            trajectory = group.name == "/" and _is_trajectory(file)
+            if len(rows) > 1 and not trajectory:
                 raise DataError(f"{path}: {group.name}: the data sets differ in length")
-            return rows.pop(), quantities
     except (OSError, KeyError, RuntimeError) as error:
         raise DataError(f"{path}: no readable HDF5 file: {_short(error)}") from None
+    first, count = _last_frame(path) if trajectory else (0, rows.pop())
+    return first, count, quantities
+
+
+def _is_trajectory(file: h5py.File) -> bool:
+    from dem_mpi.h5files import read_attribute
+    from dem_mpi.trajectory import FORMAT
+
+    try:
+        return read_attribute(file, "format") == FORMAT
+    except (KeyError, DataError):
+        return False
+
+
+def _last_frame(path: Path) -> tuple[int, int]:
+    """First row and number of rows of a trajectory's last complete frame."""
+    from dem_mpi.h5files import open_checked
+    from dem_mpi.trajectory import read_index
+
+    with open_checked(path) as file:
+        index = read_index(path, file)
+    if not len(index):
+        raise DataError(f"{path}: holds no complete frame")
+    return int(index.offset[-1]), int(index.count[-1])
 
 
 def _member(path: Path, group: h5py.Group, name: str, kind: type) -> h5py.Group | h5py.Dataset:

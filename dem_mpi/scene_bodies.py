@@ -202,7 +202,8 @@ class Placement(Model):
     )
     file: str | None = note(
         "CSV (header x,y,z[,radius][,vx,vy,vz][,wx,wy,wz][,qw,qx,qy,qz]) or HDF5 file (.h5, .hdf5) "
-        "relative to the scene; what it states replaces the group's radius, velocities and axis",
+        "relative to the scene; what it states replaces the group's radius, velocities and axis. "
+        "Of the run.h5 of another run, all bodies of the last frame",
         default=None,
         min_length=1,
         max_length=4096,

@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 
 from dem_mpi.errors import DataError, InputError
+from dem_mpi.output import read_frame
+from dem_mpi.parallel import Parallel
 from dem_mpi.placement import grid, place_share
 from dem_mpi.scenario import Scenario, body_count, load_scenario, parse_scenario
 from dem_mpi.scene_bodies import JitteredGrid
+
+from runs import PILE, simulate
 
 HEAD = """\
 domain: {min: [-1, -1, -1], max: [2, 2, 2]}
@@ -390,6 +394,12 @@ def _group_instead(file: h5py.File) -> None:
     file.create_group("position")
 
 
+def _trajectory_of_elsewhere(file: h5py.File) -> None:
+    _plain(file)
+    file.attrs["format"] = np.bytes_(b"dem-mpi trajectory")
+    file["frames"] = h5py.ExternalLink("secret.h5", "/")
+
+
 def _lengths_differ(file: h5py.File) -> None:
     _plain(file)
     file["radius"] = np.ones(3)
@@ -414,6 +424,7 @@ def _not_finite(file: h5py.File) -> None:
         (_no_direction, r"body 1 \(from 0\): orientation must be a quaternion"),
         (_scalar, "has shape"),
         (_group_instead, "is no dataset"),
+        (_trajectory_of_elsewhere, "'/frames' is a link by name or to another file"),
         (_lengths_differ, "differ in length"),
         (_not_finite, "position must be finite"),
     ],
@@ -434,6 +445,19 @@ def test_truncated_hdf5_is_refused(tmp_path: Path, size: int):
     (tmp_path / "b.h5").write_bytes(whole[:size])
     with pytest.raises(DataError, match="no readable HDF5 file"):
         load_scenario(file_scene(tmp_path, "b.h5"))
+
+
+def test_a_run_begins_with_the_last_frame_of_another(tmp_path: Path):
+    simulate(Parallel.alone(), PILE, tmp_path, "time.end=0.02")
+    last = read_frame(tmp_path / "run.h5", -1)
+    with h5py.File(tmp_path / "run.h5") as file:
+        assert len(file["position"]) > len(last.columns["gid"])
+    scene = load_scenario(file_scene(tmp_path, "run.h5", "")).scenario
+    assert body_count(scene) == 60
+    bodies = place_share(scene, 0, 1)
+    for name in ("position", "velocity", "angular_velocity", "radius"):
+        assert bodies[name].tobytes() == last.columns[name].tobytes(), name
+    np.testing.assert_allclose(bodies["orientation"], last.columns["orientation"], atol=4e-16)
 
 
 def test_missing_hdf5_group_is_named(tmp_path: Path):
