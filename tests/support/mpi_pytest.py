@@ -226,6 +226,8 @@ def _report(item: pytest.Item, text: str) -> pytest.TestReport:
 def _output(done: Any, folder: Path, records: list[_Record], lines: int = 60) -> str:
     """The end of what mpirun printed and, where no test began, what each rank's pytest did."""
     parts = [("mpirun", done.stdout + done.stderr)]
+    stacks = [folder / f"rank{rank}.stacks" for rank in range(len(records))]
+    parts += [(path.name, path.read_text(errors="replace")) for path in stacks if path.exists()]
     if not any(record.began for record in records):
         logs = [folder / f"rank{rank}.log" for rank in range(len(records))]
         parts += [(log.stem, log.read_text(errors="replace")) for log in logs if log.exists()]
@@ -245,7 +247,8 @@ class RankReporter:
         self._world = world
         self.folder = folder
         self._record = (folder / f"rank{world.rank}.jsonl").open("w")
-        self._stderr = os.fdopen(os.dup(2), "w")  # pytest captures descriptor 2
+        # A file of its own: on mpirun's one stream the lines of several ranks cut each other up.
+        self._stacks = (folder / f"rank{world.rank}.stacks").open("w")
         self._failed = False
 
     def pytest_configure(self, config: pytest.Config) -> None:
@@ -269,7 +272,7 @@ class RankReporter:
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, Any, Any]:
         self._write(what="begin", test=item.nodeid)
         # A watchdog in C: it fires in a blocked MPI call too, and shows where every rank stands.
-        faulthandler.dump_traceback_later(_timeout(item), exit=True, file=self._stderr)
+        faulthandler.dump_traceback_later(_timeout(item), exit=True, file=self._stacks)
         try:
             result = yield
             if self._failed:
