@@ -49,16 +49,23 @@ class Apgd:
         self.options = options or ApgdOptions()
 
     def solve(
-        self, problem: ConeProblem, guess: NDArray, lipschitz: float | None = None
+        self,
+        problem: ConeProblem,
+        guess: NDArray,
+        lipschitz: float | None = None,
+        tolerance: Tolerance | None = None,
     ) -> SolveReport:
         """Collective. Iterate from `guess` (m, columns) [N s] until the tolerance holds.
+
+        `tolerance` takes the place of the one in the options for this problem.
 
         Returns the best iterate seen, with the reason in words when it did not converge. Rows of
         the guess that are not finite start from zero. The guess is taken over, not copied: memory
         for a contact is what bounds the size of a scene.
         """
         started = perf_counter()
-        options, parallel, tolerance = self.options, problem.parallel, self.options.tolerance
+        options, parallel = self.options, problem.parallel
+        tolerance = tolerance or options.tolerance
         step_kernel = kernels.gradient_step.using(problem.threads)
         bend_kernel = kernels.curvature.using(problem.threads)
         project = kernels.project.using(problem.threads)
@@ -157,6 +164,9 @@ class Apgd:
             reason="converged" if converged else reason,
             lipschitz=L,
         )
+
+    def destroy(self) -> None:
+        """Nothing is kept between solves."""
 
     @staticmethod
     def _fresh(problem: ConeProblem, gamma: NDArray, g: NDArray) -> None:

@@ -1,13 +1,14 @@
-"""What every solver returns."""
+"""What every solver takes and returns."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 from numpy.typing import NDArray
 
-from dem_mpi.cone import Residuals
+from dem_mpi.cone import ConeProblem, Residuals, Tolerance
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,12 @@ class SolveReport:
     impulse  : (m, columns) [N s], inside the cones
     velocity : (m, columns) [m/s], g = N impulse + b from a fresh product
     history  : (k, 4) iteration, dual residual [m/s], complementarity [J], objective [J]
-    lipschitz: last step-size constant, a starting value for the next problem of its kind
+    lipschitz: last step-size constant of APGD, a starting value for the next problem of its kind
+    solver   : the method that made the impulse, "apgd" or "scip"
+    outer    : cone problems solved in turn; more than one only under Coulomb's law
+    form, factor_entries, linear_residual, refinements : of the Newton systems, where there are any:
+               the unknowns chosen ("velocity" or "contact"), non-zeros of the factor, the worst
+               relative residual, and the refinement steps spent to reach it
     """
 
     impulse: NDArray
@@ -31,3 +37,28 @@ class SolveReport:
     converged: bool
     reason: str
     lipschitz: float
+    solver: str = "apgd"
+    outer: int = 1
+    form: str = ""
+    factor_entries: int = 0
+    linear_residual: float = 0.0
+    refinements: int = 0
+
+
+class Solver(Protocol):
+    """A method for the cone complementarity problem."""
+
+    def solve(
+        self,
+        problem: ConeProblem,
+        guess: NDArray,
+        lipschitz: float | None = None,
+        tolerance: Tolerance | None = None,
+    ) -> SolveReport:
+        """Collective. Solve from `guess` (m, columns) [N s], which is taken over, not copied.
+
+        `tolerance` takes the place of the one in the solver's options for this problem.
+        """
+
+    def destroy(self) -> None:
+        """Collective. Free what is kept between solves."""
