@@ -105,8 +105,15 @@ def run_command(
         _print(f"warning: {warning}", error=True)
     set_threads(loaded.scenario.threads)
     started = perf_counter()
-    operators, kinds = (loaded.scenario.contact.operator,), (kind_of(loaded.scenario),)
-    warm_up(parallel, loaded.scenario.threads, operators, kinds)
+    contact, kinds = loaded.scenario.contact, (kind_of(loaded.scenario),)
+    warm_up(
+        parallel,
+        loaded.scenario.threads,
+        (contact.operator,),
+        kinds,
+        (contact.solver,),
+        contact.law,
+    )
     seconds = perf_counter() - started
     if seconds > 2.0:
         _print(f"compiled kernels in {seconds:.0f} s (first run only; kept in the numba cache)")

@@ -93,10 +93,43 @@ class Time(Model):
     )
 
 
+class Scip(Model):
+    """The interior point method, used by `solver: scip` and `solver: auto`."""
+
+    max_iterations: Whole = quantity(
+        "1", "Newton iterations per cone problem at most", default=60, ge=1
+    )
+    form: Literal["auto", "velocity", "contact"] = note(
+        "Unknowns of the Newton systems; auto: those whose factor is estimated to be smaller",
+        default="auto",
+    )
+    linear: Literal["mumps", "cg"] = note(
+        "Newton systems by Cholesky factors, or by conjugate gradients", default="mumps"
+    )
+    ordering: Literal["auto", "amd", "metis", "scotch", "pord"] = note(
+        "Fill-reducing ordering of the factorisation", default="auto"
+    )
+    workspace: Whole = quantity(
+        "1", "Extra working space of the factorisation in percent of its estimate", default=35, ge=1
+    )
+    memory: Positive | None = quantity(
+        "MB", "Memory a rank may use for factors at most; null: no limit", default=None
+    )
+
+
 class Contact(Model):
     """The contact solve of each step and its tolerance."""
 
-    solver: Literal["apgd"] = note("Method for the cone complementarity problem", default="apgd")
+    solver: Literal["apgd", "scip", "auto"] = note(
+        "Method for the cone complementarity problem: apgd, first order, cheap iterations; scip, "
+        "interior point, tight tolerances; auto: apgd first, scip where that promises less work",
+        default="apgd",
+    )
+    law: Literal["ccp", "coulomb"] = note(
+        "ccp: one convex problem a step, sliding contacts open by h mu |v_t|; coulomb: Coulomb's "
+        "law itself, several such problems a step",
+        default="ccp",
+    )
     tolerance: Positive = quantity(
         "m/s",
         "Largest residual, which times h is the overlap a step adds; a pure number for the other "
@@ -114,7 +147,10 @@ class Contact(Model):
         "thesis: measure (2.37) of S. De, PhD thesis, University of Michigan 2021",
         default="absolute",
     )
-    max_iterations: Whole = quantity("1", "Iterations per step at most", default=5000, ge=1)
+    max_iterations: Whole = quantity(
+        "1", "Iterations of apgd per cone problem at most", default=5000, ge=1
+    )
+    scip: Scip = note("Interior point method", default=Scip())
     warm_start: Switch = note("Start from the impulses of the last step", default=True)
     recovery_speed: Positive | None = quantity(
         "m/s", "Largest speed at which overlap is pushed out; null: no bound", default=0.2

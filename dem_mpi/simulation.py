@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dem_mpi import _kernels_solver as kernels
 from dem_mpi import insertion, integrator, shapes
 from dem_mpi.bodies import Bodies, ImpulseMemory
-from dem_mpi.cone import ConeProblem, Tolerance, median_of_positive
+from dem_mpi.cone import ConeProblem, median_of_positive
 from dem_mpi.contacts import (
     ContactSet,
     DetectionOptions,
@@ -38,7 +38,7 @@ from dem_mpi.partition import balance, imbalance, migrate
 from dem_mpi.periodic import AXES, PeriodicBox
 from dem_mpi.scenario import Scenario, friction_table, frictional
 from dem_mpi.scene_models import only_spheres
-from dem_mpi.solvers.apgd import Apgd, ApgdOptions
+from dem_mpi.solvers.choice import SolverOptions, make_solver
 from dem_mpi.solvers.result import SolveReport
 from dem_mpi.state import State
 from dem_mpi.walls import Walls, wall_faces, walls_at
@@ -73,8 +73,14 @@ class StepRecord:
     time: float
     bodies: int
     contacts: int
+    solver: str
     iterations: int
     products: int
+    factorisations: int
+    outer: int
+    form: str
+    factor_entries: int
+    linear_residual: float
     converged: bool
     reason: str
     r_p: float
@@ -162,12 +168,9 @@ class Simulation:
             state.wall_impulse, state.wall_time = np.zeros((len(self._faces.name), 6)), 0.0
         contact = scenario.contact
         self._detection = self._detection_options()
-        self._tolerance = Tolerance(
-            contact.tolerance, contact.tolerance_kind, contact.complementarity
-        )
-        self._solver = Apgd(
-            ApgdOptions(tolerance=self._tolerance, max_iterations=contact.max_iterations)
-        )
+        options = SolverOptions.of(contact)
+        self._tolerance = options.tolerance
+        self._solver = make_solver(options)
         self._neighbours: Neighbours | None = None
         if state.reference is not None:
             self._neighbours = find_neighbours(
@@ -579,14 +582,21 @@ class Simulation:
             )
         else:
             return
-        g, mu = report.velocity, substep.contacts.friction
-        violation = mu * np.sqrt(np.sum(g[:, 1:] ** 2, axis=1)) - g[:, 0]
+        violation = -report.velocity[:, 0]
+        if self.scenario.contact.law == "ccp":
+            slip = np.sqrt(np.sum(report.velocity[:, 1:] ** 2, axis=1))
+            violation += substep.contacts.friction * slip
         low, high = self._worst_contact(substep.contacts, violation)
         raise SolverFailureError(
             f"step {step}: {why}: r_d = {residuals.dual:.3g} m/s, worst at the contact of body "
-            f"{low} with {self._name(high)}. Raise contact.max_iterations, lower time.step, or set "
+            f"{low} with {self._name(high)}. {self._remedy()}, lower time.step, or set "
             f"contact.on_failure: shrink_step"
         )
+
+    def _remedy(self) -> str:
+        if self.scenario.contact.solver == "apgd":
+            return "Raise contact.max_iterations, set contact.solver: auto"
+        return "Raise contact.scip.max_iterations"
 
     def _worst_contact(self, contacts: ContactSet, measure: NDArray) -> tuple[int, int]:
         """Collective. The gids of the contact with the largest, or an undefined, measure (m,)."""
@@ -633,8 +643,14 @@ class Simulation:
             time=state.step * self.scenario.time.step,
             bodies=motion.bodies,
             contacts=int(counts[0]),
+            solver=last.report.solver,
             iterations=sum(s.report.iterations for s in done),
             products=sum(s.report.products for s in done),
+            factorisations=sum(s.report.factorisations for s in done),
+            outer=sum(s.report.outer for s in done),
+            form=last.report.form,
+            factor_entries=last.report.factor_entries,
+            linear_residual=max(s.report.linear_residual for s in done),
             converged=not missed,
             reason=missed[0] if missed else "converged",
             r_p=max(r.primal for r in residuals),
@@ -681,6 +697,7 @@ class Simulation:
 
     def destroy(self) -> None:
         """Collective. Free the PETSc objects."""
+        self._solver.destroy()
         if self._operator is not None:
             self._operator.destroy()
             self._operator = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numba
 import numpy as np
 
@@ -35,7 +37,8 @@ walls:
       motion: {{velocity: [0, 0, 0.1]}}}}
 time: {{step: 1e-3, end: 2e-3}}
 threads: {threads}
-contact: {{operator: {operator}, max_iterations: 3, stop_factor: 1e9}}
+contact: {{operator: {operator}, solver: {solver}, law: {law}, max_iterations: 3,
+  stop_factor: 1e9}}
 """
 
 
@@ -55,20 +58,23 @@ def warm_up(
     threads: int,
     operators: tuple[str, ...] = ("matrix_free",),
     kinds: tuple[str, ...] = (SPHERES,),
+    solvers: tuple[str, ...] = ("apgd",),
+    law: str = "ccp",
 ) -> None:
     """Collective. Compile what these operators and kinds of scene use on rank 0, then load it.
 
     kinds : SPHERES, GENERAL or both; a scene with any body that is not a sphere is GENERAL.
+    solvers, law : as in the contact section of a scene
     """
-    if "assembled" in operators:
+    if "assembled" in operators or {"scip", "auto"} & set(solvers):
         # PETSc starts on all ranks together: one that came alone would wait for the others.
         import petsc4py.PETSc  # noqa: F401
     error = None
     for turn in (True, False):
         if (parallel.rank == 0) == turn:
             try:
-                for kind in kinds:
-                    _exercise(threads, operators, kind)
+                for operator, kind, solver in product(operators, kinds, solvers):
+                    _exercise(threads, operator, kind, solver, law)
             except Exception as caught:
                 error = caught
         parallel.raise_together(error)
@@ -79,27 +85,31 @@ def kind_of(scenario: Scenario) -> str:
     return SPHERES if only_spheres(scenario) else GENERAL
 
 
-def _exercise(threads: int, operators: tuple[str, ...], kind: str) -> None:
+def _exercise(threads: int, operator: str, kind: str, solver: str, law: str) -> None:
     """Run two steps of a scene of four bodies on this rank alone."""
     alone = Parallel.alone()
-    for operator in operators:
-        text = _SCENE.format(
-            threads=threads, operator=operator, shape=kind, aspect_ratio=_ASPECT_RATIO[kind]
-        )
-        scenario = parse_scenario(text, "warm-up").scenario
-        place(alone, scenario)  # random places have kernels of their own
-        position = np.array([[0.0, 0, 0.1], [0.2, 0, 0.1], [0, 0.2, 0.1], [0.2, 0.2, 0.1]])
-        arrays = {
-            "gid": np.arange(4),
-            "material": np.zeros(4, np.int32),
-            "radius": np.full(4, 0.1),
-            "shape": np.full(4, SHAPES.index(kind), np.int8),
-            "half_length": np.full(4, 0.1 if kind == GENERAL else 0.0),
-            "position": position,
-        }
-        state = start(alone, Bodies.from_arrays(arrays, np.array([1000.0])))
-        simulation = Simulation(alone, scenario, state)
-        simulation.step()
-        simulation.step()
-        simulation.destroy()
+    text = _SCENE.format(
+        threads=threads,
+        operator=operator,
+        shape=kind,
+        aspect_ratio=_ASPECT_RATIO[kind],
+        solver=solver,
+        law=law,
+    )
+    scenario = parse_scenario(text, "warm-up").scenario
+    place(alone, scenario)  # random places have kernels of their own
+    position = np.array([[0.0, 0, 0.1], [0.2, 0, 0.1], [0, 0.2, 0.1], [0.2, 0.2, 0.1]])
+    arrays = {
+        "gid": np.arange(4),
+        "material": np.zeros(4, np.int32),
+        "radius": np.full(4, 0.1),
+        "shape": np.full(4, SHAPES.index(kind), np.int8),
+        "half_length": np.full(4, 0.1 if kind == GENERAL else 0.0),
+        "position": position,
+    }
+    state = start(alone, Bodies.from_arrays(arrays, np.array([1000.0])))
+    simulation = Simulation(alone, scenario, state)
+    simulation.step()
+    simulation.step()
+    simulation.destroy()
     alone.free()

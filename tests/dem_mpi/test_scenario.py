@@ -246,7 +246,7 @@ def test_override_error_names_the_override_instead_of_a_line():
         ("output.path=../run.h5", "--out names the directory"),
         ("output.fields=[speed]", "must be one of position, velocity"),
         ("checkpoint.keep=0", "must be >= 1"),
-        ("contact.solver=apdg", "must be apgd. Did you mean 'apgd'?"),
+        ("contact.solver=apdg", "must be one of apgd, scip, auto. Did you mean 'apgd'?"),
         ("contact.warm_start=yes", "must be true or false, not text"),
         ("contact.recovery_speed=0", "must be > 0 [m/s]"),
         ("threads=0", "must be >= 1"),
