@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from dem_mpi.cone import Tolerance
 from dem_mpi.scene_models import Contact
 from dem_mpi.scene_models import Scip as ScipSection
 from dem_mpi.solvers.result import Solver
+
+if TYPE_CHECKING:
+    from dem_mpi.solvers.apgd import Apgd
+    from dem_mpi.solvers.scip import Scip
 
 
 @dataclass(frozen=True)
@@ -33,30 +37,31 @@ class SolverOptions:
 
 def make_solver(options: SolverOptions) -> Solver:
     """Return the solver. What it does not need is not imported: PETSc only for Newton systems."""
-    if options.law == "coulomb":
-        from dem_mpi.solvers.coulomb import Coulomb
+    inner = _cone_solver(options)
+    if options.law == "ccp":
+        return inner
+    from dem_mpi.solvers.coulomb import Coulomb
 
-        return Coulomb(_cone_solver(options, options.tolerance), options.tolerance)
-    return _cone_solver(options, options.tolerance)
+    return Coulomb(inner, options.tolerance)
 
 
-def _cone_solver(options: SolverOptions, tolerance: Tolerance) -> Solver:
+def _cone_solver(options: SolverOptions) -> Solver:
     if options.solver == "apgd":
-        return _apgd(options, tolerance)
+        return _apgd(options)
     if options.solver == "scip":
-        return _scip(options, tolerance)
+        return _scip(options)
     from dem_mpi.solvers.auto import Auto
 
-    return Auto(_apgd(options, tolerance), _scip(options, tolerance))
+    return Auto(_apgd(options), _scip(options))
 
 
-def _apgd(options: SolverOptions, tolerance: Tolerance) -> Solver:
+def _apgd(options: SolverOptions) -> Apgd:
     from dem_mpi.solvers.apgd import Apgd, ApgdOptions
 
-    return Apgd(ApgdOptions(tolerance=tolerance, max_iterations=options.max_iterations))
+    return Apgd(ApgdOptions(options.tolerance, options.max_iterations))
 
 
-def _scip(options: SolverOptions, tolerance: Tolerance) -> Solver:
+def _scip(options: SolverOptions) -> Scip:
     from dem_mpi.newton import NewtonOptions
     from dem_mpi.solvers.scip import Scip, ScipOptions
 
@@ -68,4 +73,4 @@ def _scip(options: SolverOptions, tolerance: Tolerance) -> Solver:
         workspace=section.workspace,
         memory=section.memory,
     )
-    return Scip(ScipOptions(tolerance, section.max_iterations, newton))
+    return Scip(ScipOptions(options.tolerance, section.max_iterations, newton))
