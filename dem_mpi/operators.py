@@ -55,6 +55,7 @@ class MatrixFree:
         kernels.incidence(contacts.b, bodies, self._start, self._second)
         self._world = np.empty((contacts.count, 3))
         self._u = np.zeros((bodies, _freedoms(contacts, frictional)))
+        self._momentum: NDArray | None = None
         self._threads = threads
         loops = rigid if _is_general(contacts) else kernels
         self._to_world = kernels.to_world.using(threads)
@@ -81,6 +82,38 @@ class MatrixFree:
     def apply(self, impulse: NDArray, out: NDArray) -> None:
         """Collective. out = N impulse."""
         self.contact_velocity(self.body_velocity(impulse), out)
+
+    def body_impulse(self, impulse: NDArray) -> NDArray:
+        """Collective. D impulse on owned bodies, (n, 6 or 3); a view that the next call overwrites.
+
+        Columns: impulse [N s], angular impulse [N m s].
+        """
+        if self._momentum is None:
+            self._momentum = np.zeros_like(self._u)
+        c = self.contacts
+        self._to_world(c.normal, impulse, self._world)
+        self._to_bodies(
+            c.normal, c.arm, self._world, c.row, self.halo.owned, self._start, self._second,
+            *_unit_masses(*self.inverse_masses), self._momentum,
+        )  # fmt: skip
+        self.halo.reverse_add(self._momentum)
+        return self._momentum[: self.halo.owned]
+
+    def relative_velocity(self, u: NDArray, out: NDArray) -> None:
+        """Collective. out = D^T u for velocities of the owned bodies u (n, 6 or 3)."""
+        self._u[: self.halo.owned] = u
+        self.halo.forward(self._u)
+        self.contact_velocity(self._u, out)
+
+    @property
+    def freedoms(self) -> int:
+        """Degrees of freedom of a body, 6 or 3."""
+        return self._u.shape[1]
+
+    @property
+    def inverse_masses(self) -> tuple[NDArray, NDArray]:
+        """Inverse masses (n + g,) and inverse inertias (n + g,) or (n + g, 6)."""
+        return self._inverse_mass, self._inverse_inertia
 
     def diagonal(self) -> NDArray:
         """Return the diagonal of N, (m, columns) [1/kg]."""
@@ -115,7 +148,7 @@ class Assembled:
         self.contacts = contacts
         self.columns = 3 if frictional else 1
         self._dof = _freedoms(contacts, frictional)
-        self._halo = halo
+        self.halo = halo
         self._parallel = parallel
         owned = halo.owned
         _check_index_width(parallel, owned * self._dof, contacts.count * self.columns, PETSc)
@@ -130,7 +163,7 @@ class Assembled:
         sizes = ((contacts.count * self.columns, None), (owned * self._dof, None))
         self.d_transposed = self._petsc.Mat().createAIJ(sizes, csr=csr, comm=comm)
         sizes = ((owned * self._dof, None), (owned * self._dof, None))
-        self._body_mass = inverse_mass
+        self._body_mass, self._body_inertia = inverse_mass, inverse_inertia
         csr = self._mass_rows(inverse_inertia)
         self.inverse_mass = self._petsc.Mat().createAIJ(sizes, csr=csr, comm=comm)
         self._diag = _diagonal(contacts, self.columns, inverse_mass, inverse_inertia)
@@ -153,6 +186,7 @@ class Assembled:
         self.d_transposed.setValuesCSR(indptr, indices, values)
         self.d_transposed.assemble()
         if inverse_inertia is not None:
+            self._body_inertia = inverse_inertia
             self.inverse_mass.setValuesCSR(*self._mass_rows(inverse_inertia))
             self.inverse_mass.assemble()
             self._diag = _diagonal(contacts, self.columns, self._body_mass, inverse_inertia)
@@ -177,7 +211,7 @@ class Assembled:
 
     def _mass_rows(self, inverse_inertia: NDArray) -> tuple[NDArray, NDArray, NDArray]:
         """Rows of M^-1: diagonal, or for general bodies with a 3 x 3 block for the rotation."""
-        owned, dof, index = self._halo.owned, self._dof, self._petsc.IntType
+        owned, dof, index = self.halo.owned, self._dof, self._petsc.IntType
         mass = self._body_mass[:owned]
         if inverse_inertia.ndim == 2:
             indices, values = np.empty((owned, 12), index), np.empty((owned, 12))
@@ -198,14 +232,14 @@ class Assembled:
         self._gamma.getArray()[:] = impulse.ravel()
         self.d_transposed.multTranspose(self._gamma, self._w)
         self.inverse_mass.mult(self._w, self._u)
-        owned = self._halo.owned
+        owned = self.halo.owned
         self._local[:owned] = self._u.getArray(readonly=True).reshape(owned, self._dof)
-        self._halo.forward(self._local)
+        self.halo.forward(self._local)
         return self._local
 
     def contact_velocity(self, u: NDArray, out: NDArray) -> None:
         """Collective. out = D^T u for body velocities u, of which the owned rows are read."""
-        self._u.getArray()[:] = u[: self._halo.owned].ravel()
+        self._u.getArray()[:] = u[: self.halo.owned].ravel()
         self.d_transposed.mult(self._u, self._g)
         out[:] = self._g.getArray(readonly=True).reshape(out.shape)
 
@@ -216,6 +250,26 @@ class Assembled:
         self.inverse_mass.mult(self._w, self._u)
         self.d_transposed.mult(self._u, self._g)
         out[:] = self._g.getArray(readonly=True).reshape(out.shape)
+
+    def body_impulse(self, impulse: NDArray) -> NDArray:
+        """Collective. D impulse on owned bodies, (n, 6 or 3) [N s, N m s]."""
+        self._gamma.getArray()[:] = impulse.ravel()
+        self.d_transposed.multTranspose(self._gamma, self._w)
+        return self._w.getArray(readonly=True).reshape(self.halo.owned, self._dof)
+
+    def relative_velocity(self, u: NDArray, out: NDArray) -> None:
+        """Collective. out = D^T u for velocities of the owned bodies u (n, 6 or 3)."""
+        self.contact_velocity(u, out)
+
+    @property
+    def freedoms(self) -> int:
+        """Degrees of freedom of a body, 6 or 3."""
+        return self._dof
+
+    @property
+    def inverse_masses(self) -> tuple[NDArray, NDArray]:
+        """Inverse masses (n + g,) and inverse inertias (n + g,) or (n + g, 6)."""
+        return self._body_mass, self._body_inertia
 
     def diagonal(self) -> NDArray:
         """Return the diagonal of N, (m, columns) [1/kg]."""
@@ -242,6 +296,14 @@ def _is_general(contacts: ContactSet) -> bool:
 def _freedoms(contacts: ContactSet, frictional: bool) -> int:
     """Degrees of freedom of a body: 3 only where no contact can turn it."""
     return 6 if frictional or _is_general(contacts) else 3
+
+
+def _unit_masses(inverse_mass: NDArray, inverse_inertia: NDArray) -> tuple[NDArray, NDArray]:
+    """Masses and inertias of one, with which loops for M^-1 D give D itself."""
+    unit = np.ones_like(inverse_inertia)
+    if unit.ndim == 2:
+        unit[:] = (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
+    return np.ones_like(inverse_mass), unit
 
 
 def _diagonal(

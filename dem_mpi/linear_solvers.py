@@ -1,0 +1,193 @@
+"""Solvers for one symmetric matrix after another of the same pattern: MUMPS, and PETSc's CG.
+
+Both are PETSc KSP objects with the options prefix `scip_`. The matrix is refilled by its owner;
+`set_up` takes its new values and keeps what depends on the pattern alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+from dem_mpi.errors import DemError
+from dem_mpi.parallel import Parallel
+
+PREFIX = "scip_"
+Ordering = Literal["auto", "amd", "metis", "scotch", "pord"]
+
+# MUMPS numbers its orderings (its users' guide, ICNTL(7)).
+_ORDERINGS = {"amd": 0, "scotch": 3, "pord": 4, "metis": 5, "auto": 7}
+# Errors that more working space cures (INFOG(1)): integer and real space of the factorisation.
+_TOO_LITTLE_SPACE = (-8, -9, -14, -15, -17, -20)
+# Errors that say that memory is short, and INFOG(2) how much: entries, or -millions of them.
+_NO_MEMORY = (-5, -7, -13, -19)
+_RETRY_FACTOR = 4  # times as much extra space, once
+_MEGABYTE = 1e6
+# Memory of MUMPS's analysis on rank 0: row and column of each entry of one triangle, read from all
+# ranks, and about as much again for the graph that is ordered [B per entry of the matrix].
+_ANALYSIS_BYTES = 12.0
+
+
+class NewtonFailureError(DemError):
+    """A Newton system could not be solved; the text says what failed and which key may help."""
+
+
+@dataclass(frozen=True)
+class DirectOptions:
+    """Options of MUMPS.
+
+    ordering  : of the elimination; "auto" lets MUMPS choose
+    workspace : extra working space of the factorisation [%] (ICNTL(14))
+    memory    : limit of MUMPS's memory on each rank [MB] (ICNTL(23)); None for no limit
+    """
+
+    ordering: Ordering = "auto"
+    workspace: int = 35
+    memory: float | None = None
+
+
+class LinearSolver(Protocol):
+    """Solves K x = b for the present values of K."""
+
+    entries: int  # non-zeros of the factor, 0 if there is none
+    memory: float  # [B] of all ranks together
+    retries: int  # factorisations that had to be repeated with more working space
+
+    def set_up(self) -> None:
+        """Collective. Take the matrix's new values. NewtonFailureError on all ranks."""
+
+    def solve(self, b: Any, x: Any, tolerance: float) -> int:
+        """Collective. x = K^-1 b, PETSc vectors; return the iterations spent, 0 if direct."""
+
+    def destroy(self) -> None:
+        """Collective. Free the PETSc objects."""
+
+
+class Direct:
+    """MUMPS: Cholesky where the matrix is marked SPD, LDL^T if symmetric, else LU.
+
+    Analysis on rank 0 alone: MUMPS 5.5's parallel one can end in wrong numbers without an error.
+    """
+
+    def __init__(
+        self, matrix: Any, block: int, symmetric: bool, options: DirectOptions, parallel: Parallel
+    ) -> None:
+        """Collective. `block` rows belong together: the graph is analysed by blocks."""
+        self._matrix, self._block, self._symmetric = matrix, block, symmetric
+        self._options, self._parallel = options, parallel
+        self._workspace = options.workspace
+        self.entries, self.memory, self.retries, self.analyses = 0, 0.0, 0, 0
+        self._ksp: Any = None
+        self._check_analysis_memory()
+
+    def _check_analysis_memory(self) -> None:
+        limit = self._options.memory
+        if limit is None:
+            return
+        entries = self._matrix.getInfo(self._matrix.InfoType.GLOBAL_SUM)["nz_used"]
+        needed = _ANALYSIS_BYTES * entries / _MEGABYTE
+        if needed > limit:
+            raise NewtonFailureError(
+                f"MUMPS cannot analyse the Newton matrix: its {entries:.3g} entries need about "
+                f"{_megabytes(needed)} MB on rank 0, and contact.scip.memory allows {limit:g} MB: "
+                f"raise it, or set contact.scip.linear: cg"
+            )
+
+    def _create(self) -> None:
+        from petsc4py import PETSc
+
+        self._ksp = PETSc.KSP().create(self._parallel.communicator)
+        self._ksp.setOptionsPrefix(PREFIX)
+        self._ksp.setType(PETSc.KSP.Type.PREONLY)
+        self._ksp.setOperators(self._matrix)
+        pc = self._ksp.getPC()
+        pc.setType(PETSc.PC.Type.CHOLESKY if self._symmetric else PETSc.PC.Type.LU)
+        pc.setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
+        pc.setFactorSetUpSolverType()
+        factor = pc.getFactorMatrix()
+        factor.setMumpsIcntl(7, _ORDERINGS[self._options.ordering])
+        factor.setMumpsIcntl(28, 1)
+        factor.setMumpsIcntl(14, self._workspace)
+        if self._block > 1 and self._symmetric:
+            factor.setMumpsIcntl(15, -self._block)
+        if self._options.memory is not None:
+            factor.setMumpsIcntl(23, max(1, int(self._options.memory)))
+        self._ksp.setFromOptions()
+        self.analyses += 1
+
+    def set_up(self) -> None:
+        """Collective. Factorise; a first time, analyse too. Once more if the space ran out."""
+        error = self._factorise()
+        if error in _TOO_LITTLE_SPACE and self._options.memory is None:
+            # PETSc does not factorise again with a factor that failed: begin anew.
+            self._workspace *= _RETRY_FACTOR
+            self.retries += 1
+            self.destroy()
+            error = self._factorise()
+        if error < 0:
+            message = self._sentence(error)
+            self.destroy()
+            raise NewtonFailureError(message)
+        factor = self._ksp.getPC().getFactorMatrix()
+        self.entries = _count(factor.getMumpsInfog(29))
+        self.memory = factor.getMumpsInfog(22) * _MEGABYTE
+
+    def _factorise(self) -> int:
+        if self._ksp is None:
+            self._create()
+        # Tells PETSc that the values are new; it sees itself that the pattern is not.
+        self._ksp.setOperators(self._matrix)
+        self._ksp.setUp()
+        return self._ksp.getPC().getFactorMatrix().getMumpsInfog(1)
+
+    def _sentence(self, error: int) -> str:
+        """What MUMPS's error means to who runs the scene."""
+        factor = self._ksp.getPC().getFactorMatrix()
+        detail, wanted = factor.getMumpsInfog(2), factor.getMumpsInfog(16)
+        rows = self._matrix.getSize()[0]
+        what = f"MUMPS could not factorise the Newton matrix of {rows} rows"
+        code = f"(INFOG(1) = {error}, INFOG(2) = {detail})"
+        limit = self._options.memory
+        if error in _TOO_LITTLE_SPACE or error in _NO_MEMORY:
+            estimate = f"its analysis asks for {wanted} MB on the fullest rank" if wanted else ""
+            phase = "factorisation" if wanted else "analysis"
+            if limit is not None:
+                short = f"and contact.scip.memory allows {limit:g} MB: raise it"
+            elif error in _NO_MEMORY:
+                short = "more than the machine gives: use more ranks on more nodes"
+            else:
+                short = (
+                    f"and {self._workspace} % on top were too little: raise contact.scip.workspace"
+                )
+            return (
+                f"{what}: too little memory in the {phase}; {estimate or 'its graph is too large'} "
+                f"{short}, try another contact.scip.ordering, or set contact.scip.linear: cg {code}"
+            )
+        if error in (-10, -40):
+            return (
+                f"{what}: it is singular to working precision, or not positive definite; "
+                f"contact.scip.form: velocity is the form that stays definite {code}"
+            )
+        if error in (-38, -39):
+            return f"{what}: this MUMPS was built without the ordering asked for {code}"
+        return f"{what}: error {error} of MUMPS, see INFOG(1) in its users' guide {code}"
+
+    def solve(self, b: Any, x: Any, tolerance: float) -> int:
+        """Collective. x = K^-1 b by two triangular solves."""
+        self._ksp.solve(b, x)
+        return 0
+
+    def destroy(self) -> None:
+        """Collective. Free the factor."""
+        if self._ksp is not None:
+            self._ksp.destroy()
+            self._ksp = None
+
+
+def _count(infog: int) -> int:
+    """A count as MUMPS gives it: negative numbers are millions."""
+    return infog if infog >= 0 else -infog * 1_000_000
+
+
+def _megabytes(value: float) -> str:
+    return f"{value:.0f}" if value >= 10.0 else f"{value:.2g}"

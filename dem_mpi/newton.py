@@ -1,0 +1,444 @@
+"""The linear system of an interior-point step: (N + R) x = s, with R block-diagonal.
+
+N = D^T M^-1 D; R_i is the block of contact i and Q_i = R_i^-1 its inverse. Two forms:
+
+    velocity  K u = D Q s,  K = M + D Q D^T,  x = Q (s - D^T u)     rows: velocities of bodies
+    contact   (N + R) x = s                                        rows: impulses of contacts
+
+K has the pattern of the contact graph, N that of contacts with a body in common. Both are symmetric
+positive definite. A contact with mu = 0 has no tangential impulse: its Q_i is (1/p, 0, 0), so K
+needs nothing special; in N + R its tangential rows and columns are those of the identity.
+
+Solutions are refined with the product N x of the operator: x is corrected by the solution for the
+residual until |s - N x - R x| <= 1e-10 |s| or that stops falling.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dem_mpi import _kernels_newton as kernels
+from dem_mpi.cone import Delassus
+from dem_mpi.linear_solvers import Direct, DirectOptions, LinearSolver, NewtonFailureError, Ordering
+from dem_mpi.operators import Assembled, MatrixFree
+from dem_mpi.parallel import Halo, Parallel
+
+__all__ = ["LinearSolve", "NewtonFailureError", "NewtonOptions", "NewtonSystem"]
+
+TOLERANCE = 1e-10  # relative residual at which refinement ends
+_REFINEMENTS = 5
+_FALLING = 0.5  # a refinement that leaves more than this part of the residual is the last
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """How Newton systems are solved; the scene's `contact.scip` names the same keys.
+
+    form      : unknowns; "auto" takes the one whose factor is estimated the smaller
+    linear    : a direct factorisation by MUMPS, or conjugate gradients (velocity form)
+    ordering  : of the elimination
+    workspace : extra working space of MUMPS [%]
+    memory    : limit of MUMPS's memory on each rank [MB]
+    """
+
+    form: Literal["auto", "velocity", "contact"] = "auto"
+    linear: Literal["mumps", "cg"] = "mumps"
+    ordering: Ordering = "auto"
+    workspace: int = 35
+    memory: float | None = None
+
+
+@dataclass(frozen=True)
+class LinearSolve:
+    """How one system was solved.
+
+    residual    : |s - (N + R) x| / |s|, Euclidean norms over all contacts
+    refinements : corrections after the first solution
+    iterations  : of conjugate gradients, over all corrections
+    products    : with N
+    """
+
+    residual: float
+    refinements: int
+    iterations: int
+    products: int
+
+
+class NewtonSystem:
+    """(N + R) x = s for one N and changing R.
+
+    form : "velocity" or "contact"; factor_entries : non-zeros of the factor; factor_memory : [B] of
+    all ranks; retries : factorisations repeated with more working space. PETSc is loaded with the
+    first object of this class.
+    """
+
+    def __init__(
+        self, operator: Delassus, mu: NDArray, parallel: Parallel, options: NewtonOptions
+    ) -> None:
+        """Collective. Choose the form and lay out the matrix. DemError on all ranks if too large.
+
+        mu : (m,). The operator is used, not owned, until `take` or `destroy`.
+        """
+        self._parallel = parallel
+        self._contacts = parallel.sum(mu.shape[0])
+        self.form = _choose_form(operator, options)
+        make = _VelocityForm if self.form == "velocity" else _ContactForm
+        self._form: _Form = make(operator, mu, parallel, options)
+
+    @property
+    def factor_entries(self) -> int:
+        """Non-zeros of the last factor, 0 if none was made."""
+        return self._form.solver.entries
+
+    @property
+    def factor_memory(self) -> float:
+        """Memory of the last factorisation on all ranks together [B]."""
+        return self._form.solver.memory
+
+    @property
+    def retries(self) -> int:
+        """Factorisations that were repeated with more working space."""
+        return self._form.solver.retries
+
+    def take(self, operator: Delassus, mu: NDArray) -> bool:
+        """Collective. Take new geometry on the same contact graph; False if the graph differs.
+
+        After True what was found out about the matrix's pattern is kept; after False this system
+        still stands for the old operator, and a new one is to be made.
+        """
+        return self._form.take(operator, mu)
+
+    def factor(self, Q: NDArray, R: NDArray) -> None:
+        """Collective. Factorise, or set up the preconditioner, for Q and R = Q^-1, (m, c, c).
+
+        NewtonFailureError on all ranks where that cannot be done.
+        """
+        finite = bool(np.isfinite(Q).all() and np.isfinite(R).all())
+        if self._parallel.any(not finite):
+            raise NewtonFailureError(
+                "the Newton matrix has entries that are not finite: the iterate has left the cones"
+            )
+        if self._contacts:
+            self._form.factor(Q, R)
+
+    def solve(self, s: NDArray, out: NDArray, tolerance: float = TOLERANCE) -> LinearSolve:
+        """Collective. out = (N + R)^-1 s, both (m, c), refined to the relative residual."""
+        form = self._form
+        s = form.masked(s)
+        out[:] = 0.0
+        size = self._norm(s)
+        if size == 0.0:
+            return LinearSolve(0.0, 0, 0, 0)
+        form.begin(s)
+        iterations = form.correct(s, out, tolerance)
+        rest = np.empty_like(s)
+        relative = self._residual(out, rest) / size
+        refinements, products = 0, 1
+        kept = np.empty_like(out)
+        while relative > tolerance and refinements < _REFINEMENTS:
+            kept[:] = out
+            iterations += form.correct(rest, out, tolerance)
+            found = self._residual(out, rest) / size
+            refinements += 1
+            products += 1
+            if not found < relative:
+                out[:] = kept
+                break
+            falling = found <= _FALLING * relative
+            relative = found
+            if not falling:
+                break
+        return LinearSolve(relative, refinements, iterations, products)
+
+    def _residual(self, x: NDArray, rest: NDArray) -> float:
+        """Collective. rest = s - (N + R) x; return its norm, which is finite."""
+        self._form.residual(x, rest)
+        norm = self._norm(rest)
+        if not math.isfinite(norm):
+            raise NewtonFailureError(
+                "the solution of the Newton system is not finite, though MUMPS reports no error: "
+                "its memory may have run out; lower the number of bodies a rank, or set "
+                "contact.scip.linear: cg"
+            )
+        return norm
+
+    def _norm(self, x: NDArray) -> float:
+        # The largest entry first: squares of large numbers would overflow.
+        largest = float(self._parallel.max(float(np.abs(x).max(initial=0.0))))
+        if largest == 0.0 or not math.isfinite(largest):
+            return largest
+        scaled = x.ravel() / largest
+        return largest * math.sqrt(self._parallel.sum(float(scaled @ scaled)))
+
+    def destroy(self) -> None:
+        """Collective. Free every PETSc object."""
+        self._form.destroy()
+
+
+class _Form(Protocol):
+    """One of the two forms; a correction solves with the factor, a residual with the operator."""
+
+    solver: LinearSolver
+
+    def take(self, operator: Any, mu: NDArray) -> bool:
+        """Collective."""
+
+    def masked(self, s: NDArray) -> NDArray:
+        """Return s with zeros in rows that have no unknown."""
+
+    def factor(self, Q: NDArray, R: NDArray) -> None:
+        """Collective."""
+
+    def begin(self, s: NDArray) -> None:
+        """Start on a new right-hand side, from x = 0."""
+
+    def correct(self, rest: NDArray, x: NDArray, tolerance: float) -> int:
+        """Collective. x += the solution for the residual `rest`; return iterations."""
+
+    def residual(self, x: NDArray, rest: NDArray) -> None:
+        """Collective. rest = s - (N + R) x."""
+
+    def destroy(self) -> None:
+        """Collective."""
+
+
+class _VelocityForm:
+    """K u = D Q s.
+
+    R x is never formed from R, whose rounded inverse is not quite Q: `_y` is what Q was multiplied
+    by to get x. So s - N x - y is what the rounding of K^-1 left, and can be reduced to round-off.
+    """
+
+    def __init__(
+        self, operator: Any, mu: NDArray, parallel: Parallel, options: NewtonOptions
+    ) -> None:
+        self._operator, self._parallel = operator, parallel
+        self._matrix = _ContactVelocityMatrix(operator, parallel)
+        self._frictionless = _frictionless_rows(mu, operator)
+        self.solver = _linear_solver(
+            self._matrix.matrix, self._matrix.block, True, options, parallel
+        )
+        self._b, self._u = self._matrix.matrix.createVecs()
+
+    def take(self, operator: Any, mu: NDArray) -> bool:
+        if not self._matrix.take(operator):
+            return False
+        self._operator = operator
+        self._frictionless = _frictionless_rows(mu, operator)
+        return True
+
+    def masked(self, s: NDArray) -> NDArray:
+        return _without_tangents(s, self._frictionless)
+
+    def factor(self, Q: NDArray, R: NDArray) -> None:
+        self._Q = Q
+        self._matrix.fill(Q)
+        self.solver.set_up()
+
+    def begin(self, s: NDArray) -> None:
+        self._s, self._y = s, np.zeros_like(s)
+        self._work = np.empty_like(s)
+
+    def correct(self, rest: NDArray, x: NDArray, tolerance: float) -> int:
+        operator, work = self._operator, self._work
+        # K u = D Q r
+        kernels.block_product.serial(self._Q, rest, work)
+        self._b.getArray()[:] = operator.body_impulse(work).ravel()
+        iterations = self.solver.solve(self._b, self._u, tolerance)
+        u = self._u.getArray(readonly=True).reshape(-1, self._matrix.block)
+        # y += r - D^T u,  x += Q (r - D^T u)
+        operator.relative_velocity(u, work)
+        np.subtract(rest, work, out=work)
+        self._y += work
+        change = np.empty_like(work)
+        kernels.block_product.serial(self._Q, work, change)
+        x += change
+        return iterations
+
+    def residual(self, x: NDArray, rest: NDArray) -> None:
+        self._operator.apply(x, rest)
+        np.subtract(self._s, rest, out=rest)
+        rest -= self._y
+        rest[self._frictionless, 1:] = 0.0
+
+    def destroy(self) -> None:
+        self.solver.destroy()
+        self._matrix.destroy()
+        for item in (self._b, self._u):
+            item.destroy()
+
+
+class _ContactForm:
+    """N + R as one matrix."""
+
+
+# ---- the matrix of the velocity form -------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Graph:
+    """The contacts of this rank's bodies: its own, then those that other ranks own.
+
+    first : global number of the first body; body : (m, 2) int64 global numbers of a and b, -1 for
+    a wall; halo : moves rows of contacts from the rank that owns them to the rank that owns b
+    """
+
+    first: int
+    owned: int
+    body: NDArray
+    halo: Halo
+
+    @classmethod
+    def of(cls, operator: MatrixFree | Assembled, parallel: Parallel) -> _Graph:
+        """Collective."""
+        contacts, bodies = operator.contacts, operator.halo
+        first = parallel.exclusive_sum(bodies.owned)
+        rows = bodies.owned + bodies.ghosts
+        number = np.zeros((rows, 2), dtype=np.int64)
+        number[: bodies.owned, 0] = first + np.arange(bodies.owned)
+        number[: bodies.owned, 1] = parallel.rank
+        bodies.forward(number)
+        joined = contacts.b >= 0
+        owner = np.where(joined, number[contacts.b, 1], parallel.rank) if rows else contacts.b
+        abroad = np.unique(owner[owner != parallel.rank]).tolist() if rows else []
+        halo = Halo.build(parallel, contacts.count, {r: np.flatnonzero(owner == r) for r in abroad})
+        body = np.full((halo.owned + halo.ghosts, 2), -1, dtype=np.int64)
+        body[: halo.owned, 0] = number[contacts.a, 0]
+        body[: halo.owned, 1][joined] = number[contacts.b[joined], 0]
+        halo.forward(body)
+        return cls(first, bodies.owned, body, halo)
+
+    def same(self, other: _Graph) -> bool:
+        """Whether the same bodies touch, as far as this rank knows."""
+        return (
+            self.first == other.first
+            and self.owned == other.owned
+            and np.array_equal(self.body, other.body)
+        )
+
+    def extend(self, owned: NDArray) -> NDArray:
+        """Collective. Rows of own contacts (m, k) with those of other ranks' behind them."""
+        rows = np.empty((self.halo.owned + self.halo.ghosts, owned.shape[1]))
+        rows[: self.halo.owned] = owned
+        self.halo.forward(rows)
+        return rows
+
+
+class _ContactVelocityMatrix:
+    """K = M + D Q D^T of spheres or rigid bodies, every rank filling the rows of its bodies."""
+
+    def __init__(self, operator: MatrixFree | Assembled, parallel: Parallel) -> None:
+        """Collective."""
+        from petsc4py import PETSc
+
+        self._petsc, self._parallel = PETSc, parallel
+        self.block = operator.freedoms
+        self._graph = graph = _Graph.of(operator, parallel)
+        count = kernels.count_incidences(graph.body, graph.first, graph.owned)
+        self._start = np.zeros(graph.owned + 1, dtype=np.int64)
+        self._incident = np.empty(count, dtype=np.int64)
+        kernels.incidences(graph.body, graph.first, graph.owned, self._start, self._incident)
+        incidence = (graph.body, graph.first, self._start, self._incident)
+        self._row = np.empty(graph.owned + 1, dtype=np.int64)
+        column = np.empty(count + graph.owned, dtype=np.int64)
+        column = column[: kernels.block_columns(*incidence, self._row, column)]
+        self._own = np.empty(graph.owned, dtype=np.int32)
+        self._slot = np.empty(count, dtype=np.int32)
+        kernels.block_slots(*incidence, self._row, column, self._own, self._slot)
+        self._take_geometry(operator)
+        self.matrix = self._create(column)
+
+    def _create(self, column: NDArray) -> Any:
+        """Collective. The PETSc matrix, with its pattern and zeros."""
+        index = self._petsc.IntType
+        rows, entries = self._graph.owned * self.block, column.size * self.block**2
+        _check_index_width(self._parallel, rows, entries, self._petsc)
+        self._indptr = np.empty(rows + 1, dtype=index)
+        self._indices = np.empty(entries, dtype=index)
+        kernels.scalar_pattern(self._row, column, self.block, self._indptr, self._indices)
+        self._values = np.zeros(entries)
+        matrix = self._petsc.Mat().create(self._parallel.communicator)
+        matrix.setSizes(((rows, None), (rows, None)), bsize=self.block)
+        matrix.setType(self._petsc.Mat.Type.AIJ)
+        matrix.setPreallocationCSR((self._indptr, self._indices, self._values))
+        return matrix
+
+    def take(self, operator: MatrixFree | Assembled) -> bool:
+        """Collective. New geometry; False if the graph or the bodies' masses differ."""
+        graph = _Graph.of(operator, self._parallel)
+        same = (
+            operator.freedoms == self.block
+            and self._graph.same(graph)
+            and np.array_equal(operator.inverse_masses[0][: graph.owned], self._inverse_mass)
+        )
+        if self._parallel.any(not same):
+            return False
+        self._graph = graph
+        self._take_geometry(operator)
+        return True
+
+    def _take_geometry(self, operator: MatrixFree | Assembled) -> None:
+        owned = self._graph.owned
+        mass, inertia = operator.inverse_masses
+        self._inverse_mass = mass[:owned]
+        self._inverse_inertia = inertia[:owned].reshape(owned, -1 if owned else 1)
+        self._normal = self._graph.extend(operator.contacts.normal)
+        self._arm = self._graph.extend(operator.contacts.arm)
+
+    def fill(self, Q: NDArray) -> None:
+        """Collective. Give the matrix its values for Q (m, c, c)."""
+        blocks = self._graph.extend(Q.reshape(len(Q), Q.shape[1] * Q.shape[2]))
+        kernels.velocity_matrix.serial(
+            self._normal, self._arm, blocks, self._start, self._incident, self._slot, self._own,
+            self._row, self._inverse_mass, self._inverse_inertia, self.block, self._values,
+        )  # fmt: skip
+        self.matrix.setValuesCSR(self._indptr, self._indices, self._values)
+        self.matrix.assemble()
+        self.matrix.setOption(self._petsc.Mat.Option.SPD, True)
+
+    def destroy(self) -> None:
+        """Collective."""
+        self.matrix.destroy()
+
+
+# ---- choices -------------------------------------------------------------------------------
+
+
+def _choose_form(operator: Any, options: NewtonOptions) -> Literal["velocity", "contact"]:
+    return "velocity"
+
+
+def _linear_solver(
+    matrix: Any, block: int, symmetric: bool, options: NewtonOptions, parallel: Parallel
+) -> LinearSolver:
+    direct = DirectOptions(options.ordering, options.workspace, options.memory)
+    return Direct(matrix, block, symmetric, direct, parallel)
+
+
+def _frictionless_rows(mu: NDArray, operator: Any) -> NDArray:
+    """Return the contacts (k,) whose tangential unknowns are fixed at zero."""
+    return np.flatnonzero(mu == 0.0)
+
+
+def _without_tangents(s: NDArray, frictionless: NDArray) -> NDArray:
+    if s.shape[1] == 1 or not frictionless.size:
+        return s
+    s = s.copy()
+    s[frictionless, 1:] = 0.0
+    return s
+
+
+def _check_index_width(parallel: Parallel, rows: int, entries: int, petsc: Any) -> None:
+    """Collective. NewtonFailureError if the matrix outgrows PETSc's indices."""
+    width = np.iinfo(petsc.IntType)
+    largest = max(parallel.sum(rows), parallel.max(entries))
+    if largest > width.max:
+        raise NewtonFailureError(
+            f"the Newton matrix has {largest} rows, or entries on a rank, more than PETSc's "
+            f"{width.bits}-bit indices can number: use a PETSc with 64-bit indices or more ranks"
+        )
