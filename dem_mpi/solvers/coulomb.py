@@ -1,0 +1,310 @@
+"""Coulomb's law of friction: cone problems in turn, by any solver of such problems.
+
+The law in De Saxce's form, for every contact:
+
+    gamma in C,  g + (s, 0, 0) in C*,  gamma.(g + (s, 0, 0)) = 0,  g = N gamma + b,  s = mu |g_t|.
+
+Held fixed, the bias s [m/s] leaves the cone problem of N and b + s. The outer iteration looks for
+the bias that the solution reproduces, s = F(s) = mu |g_t(s)| (V. Acary, F. Cadoux, C. Lemarechal,
+J. Malick, Z. Angew. Math. Mech. 91, 2011): a contact that slides then has g_n = 0, where the cone
+problem alone (s = 0) lets it open at mu |g_t|. Contacts that stick or part are the same in both.
+
+For one contact that slides dF/ds = mu^2 N_tt/(N_nn + mu^2 N_tt), so that the plain fixed point is
+slow where mu is large, and r = F(s) - s times 1 + mu^2 N_tt/N_nn is Newton's step. These steps, of
+all contacts together, are combined by Anderson acceleration (D. Anderson, J. ACM 12, 1965), which
+begins anew after an iterate that does badly.
+
+Unlike the cone problem the law may have several solutions, or none (Painleve's paradoxes, large
+mu). Which of several is found depends on the guess; where none is, the report says so and holds the
+best impulse seen.
+
+Symbols: gamma impulse; g velocity; s bias; r its residual; theta weights of past differences.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dem_mpi import _kernels_solver as kernels
+from dem_mpi.cone import ConeProblem, Residuals, Tolerance, evaluate
+from dem_mpi.parallel import Parallel
+from dem_mpi.solvers.result import Solver, SolveReport
+
+# An impulse this close to the border of its cone counts as sliding: inner solvers leave a little.
+_SLIDING = 0.999
+# A cone problem left unsolved is gone on from while the merit falls to this part of the best.
+_PROGRESS = 0.5
+# Directions of past differences below this part of the largest, in squares, are noise.
+_INDEPENDENT = 1e-10
+
+
+@dataclass(frozen=True)
+class CoulombOptions:
+    """Options of `Coulomb`.
+
+    max_outer    : cone problems at most
+    inner_factor : each is solved to this part of the smallest merit so far: early ones coarsely
+    finest       : but never below this part of the tolerance, which leaves the rest to the bias
+    relaxation   : part of the over-relaxation mu^2 N_tt/N_nn that a contact alone would ask for
+    memory       : past differences that Anderson acceleration combines; 0 switches it off
+    restart      : acceleration begins anew after a merit above this multiple of the smallest
+    """
+
+    max_outer: int = 50
+    inner_factor: float = 0.03
+    finest: float = 0.5
+    relaxation: float = 0.7
+    memory: int = 5
+    restart: float = 2.0
+
+
+class Coulomb:
+    """Solves for Coulomb's law, in which sliding contacts do not open, by an inner cone solver."""
+
+    def __init__(
+        self,
+        inner: Solver,
+        tolerance: Tolerance | None = None,
+        options: CoulombOptions | None = None,
+    ) -> None:
+        self.inner = inner
+        self.tolerance = tolerance or Tolerance()
+        self.options = options or CoulombOptions()
+
+    def solve(
+        self,
+        problem: ConeProblem,
+        guess: NDArray,
+        lipschitz: float | None = None,
+        tolerance: Tolerance | None = None,
+    ) -> SolveReport:
+        """Collective. Solve from `guess` (m, columns) [N s], which is taken over, not copied.
+
+        Velocity and residuals of the report are those of the law, with the problem's own b; counts
+        are sums over the cone problems solved, and `history` has a row for each of these, with the
+        iterations up to its end. A problem without friction is handed on as it is.
+        """
+        options, parallel = self.options, problem.parallel
+        tolerance = tolerance or self.tolerance
+        frictional = problem.b.shape[1] > 1 and bool(np.any(problem.mu > 0.0))
+        if not parallel.any(frictional):
+            return self.inner.solve(problem, guess, lipschitz, tolerance)
+
+        gamma, g = _start(problem, guess)
+        s = slip_bias(problem.mu, g)
+        least = _merit(tolerance, law_residuals(problem, gamma, g), problem)
+        newton = 1.0 + options.relaxation * _single_contact_gain(problem)
+        acceleration = _Anderson(options.memory, parallel)
+        totals = _Totals()
+        best: _Iterate | None = None
+        reason = "reached the limit of outer iterations"
+        while totals.outer < options.max_outer:
+            report = self.inner.solve(
+                _biased(problem, s), gamma.copy(), lipschitz, self._finer(tolerance, least)
+            )
+            gamma, g, lipschitz = report.impulse, _lifted(report.velocity, -s), report.lipschitz
+            residuals = law_residuals(problem, gamma, g)
+            merit = _merit(tolerance, residuals, problem)
+            totals.add(report, residuals)
+            progress = best is None or merit < _PROGRESS * best.merit
+            if best is None or merit < best.merit:
+                best = _Iterate(gamma, g, residuals, merit, report)
+            if merit <= 1.0:
+                break
+            if not math.isfinite(merit) or not (report.converged or progress):
+                reason = f"cone problem {totals.outer}: {report.reason}"
+                break
+            if merit > options.restart * best.merit:
+                acceleration.restart()
+            least = min(least, merit)
+            r = slip_bias(problem.mu, g) - s
+            r *= np.where(_slides(problem.mu, gamma), newton, 1.0)
+            # Where a contact stays open its bias is of no consequence, and no part of the fit.
+            matters = (gamma[:, 0] > 0.0) | (g[:, 0] < 0.0)
+            s = np.maximum(s + acceleration.step(s, r, matters), 0.0)
+        return totals.report(best, reason, lipschitz)
+
+    def destroy(self) -> None:
+        """Collective. Free what the inner solver keeps between solves."""
+        self.inner.destroy()
+
+    def _finer(self, tolerance: Tolerance, merit: float) -> Tolerance:
+        """Return the tolerance of a cone problem after iterates of this merit at best."""
+        part = max(self.options.finest, self.options.inner_factor * merit)
+        if merit <= 1.0 or not math.isfinite(merit):
+            part = 1.0
+        value, work = part * tolerance.value, part * tolerance.relative_work
+        return replace(tolerance, value=value, relative_work=work)
+
+
+def slip_bias(mu: NDArray, g: NDArray) -> NDArray:
+    """s = mu |g_t| [m/s] of every contact, (m,)."""
+    return mu * np.sqrt(g[:, 1] * g[:, 1] + g[:, 2] * g[:, 2])
+
+
+def law_residuals(problem: ConeProblem, impulse: NDArray, velocity: NDArray) -> Residuals:
+    """Collective. Residuals under Coulomb's law of an impulse whose N gamma + b is `velocity`.
+
+    dual is max(0, -g_n) [m/s], complementarity max |gamma_n (g_n + mu |g_t|) + gamma_t.g_t| [J]:
+    those of the cone problem with g + s. The objective is that of b, gamma.(N gamma/2 + b).
+    """
+    if velocity.shape[1] == 1:
+        return evaluate(problem, impulse, velocity)
+    s = slip_bias(problem.mu, velocity)
+    # The objective is (gamma.g + gamma.b)/2, in which b - s undoes the bias of g + s.
+    return evaluate(_biased(problem, -s), impulse, _lifted(velocity, s))
+
+
+def _lifted(rows: NDArray, s: NDArray) -> NDArray:
+    """Copy rows (m, 3) with s (m,) added to the normal part."""
+    lifted = rows.copy()
+    lifted[:, 0] += s
+    return lifted
+
+
+def _biased(problem: ConeProblem, s: NDArray) -> ConeProblem:
+    return replace(problem, b=_lifted(problem.b, s))
+
+
+def _start(problem: ConeProblem, guess: NDArray) -> tuple[NDArray, NDArray]:
+    """Collective. The guess within the cones, zero where it is not finite, and its N gamma + b."""
+    gamma = np.ascontiguousarray(guess, dtype=np.float64)
+    gamma[~np.isfinite(gamma).all(axis=1)] = 0.0
+    kernels.project.using(problem.threads)(gamma, problem.mu)
+    g = np.empty_like(gamma)
+    problem.operator.apply(gamma, g)
+    g += problem.b
+    return gamma, g
+
+
+def _merit(tolerance: Tolerance, residuals: Residuals, problem: ConeProblem) -> float:
+    return tolerance.merit(residuals, problem) if residuals.finite else math.inf
+
+
+def _single_contact_gain(problem: ConeProblem) -> NDArray:
+    """mu^2 N_tt/N_nn (m,): what 1/(1 - dF/ds) exceeds 1 by for a sliding contact on its own."""
+    diagonal = problem.operator.diagonal()
+    return problem.mu**2 * diagonal[:, 1:].mean(axis=1) / diagonal[:, 0]
+
+
+def _slides(mu: NDArray, gamma: NDArray) -> NDArray:
+    """Which contacts (m,) have an impulse on the border of their cone, its apex excepted."""
+    tangential = np.sqrt(gamma[:, 1] * gamma[:, 1] + gamma[:, 2] * gamma[:, 2])
+    return (gamma[:, 0] > 0.0) & (tangential >= _SLIDING * mu * gamma[:, 0])
+
+
+class _Anderson:
+    """Steps towards r(s) = 0 that differences of past (s, r) suggest.
+
+    With theta the weights for which |r - sum theta_j dr_j| is least, over the contacts that matter,
+    the step is r - sum theta_j (ds_j + dr_j).
+    """
+
+    def __init__(self, memory: int, parallel: Parallel) -> None:
+        self._memory, self._parallel = memory, parallel
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the past."""
+        self._ds: list[NDArray] = []
+        self._dr: list[NDArray] = []
+        self._last: tuple[NDArray, NDArray] | None = None
+
+    def step(self, s: NDArray, r: NDArray, matters: NDArray) -> NDArray:
+        """Collective. The step from s (m,) with residual r (m,), kept as a part of the past.
+
+        It is r itself without a past, and for contacts where `matters` (m,) bool is False.
+        """
+        if self._memory == 0:
+            return r
+        if self._last is not None:
+            self._ds = [*self._ds, s - self._last[0]][-self._memory :]
+            self._dr = [*self._dr, r - self._last[1]][-self._memory :]
+        self._last = s, r
+        k = len(self._dr)
+        if k == 0:
+            return r
+        ds, dr = np.array(self._ds), np.array(self._dr)
+        fitted = dr * matters
+        # Not by @: the order of a threaded BLAS's sums may change from one call to the next.
+        products = np.empty((k, k + 1))
+        products[:, :k] = np.einsum("im,jm->ij", fitted, fitted)
+        products[:, k] = np.einsum("im,m->i", fitted, r)
+        self._parallel.sum_in_place(products)
+        theta = self._parallel.broadcast(_weights(products[:, :k], products[:, k]))
+        return r - np.einsum("i,im->m", theta, ds + dr) * matters
+
+
+def _weights(gram: NDArray, rhs: NDArray) -> NDArray:
+    """Least-squares solution (k,) of gram theta = rhs, in rows and columns of unit diagonal."""
+    scale = np.sqrt(np.diag(gram))
+    scale[scale == 0.0] = 1.0
+    scaled = gram / np.outer(scale, scale)
+    return np.linalg.lstsq(scaled, rhs / scale, rcond=_INDEPENDENT)[0] / scale
+
+
+@dataclass(frozen=True)
+class _Iterate:
+    """An impulse and how well it obeys the law; velocity is N gamma + b."""
+
+    impulse: NDArray
+    velocity: NDArray
+    residuals: Residuals
+    merit: float
+    inner: SolveReport
+
+
+@dataclass
+class _Totals:
+    """Sums over the cone problems of a solve; the first product is that of the guess."""
+
+    outer: int = 0
+    iterations: int = 0
+    products: int = 1
+    factorisations: int = 0
+    refinements: int = 0
+    factor_entries: int = 0
+    linear_residual: float = 0.0
+    seconds: Counter[str] = field(default_factory=Counter)
+    history: list[tuple[float, ...]] = field(default_factory=list)
+
+    def add(self, report: SolveReport, residuals: Residuals) -> None:
+        """Count one cone problem, after which the law had these residuals."""
+        self.outer += 1
+        self.iterations += report.iterations
+        self.products += report.products
+        self.factorisations += report.factorisations
+        self.refinements += report.refinements
+        self.factor_entries = max(self.factor_entries, report.factor_entries)
+        self.linear_residual = max(self.linear_residual, report.linear_residual)
+        self.seconds.update(report.seconds)
+        self.history.append(
+            (self.iterations, residuals.dual, residuals.complementarity, residuals.objective)
+        )
+
+    def report(self, best: _Iterate, reason: str, lipschitz: float) -> SolveReport:
+        """Return the report of the best iterate; `reason` is why there is none that converged."""
+        converged = best.merit <= 1.0
+        return replace(
+            best.inner,
+            impulse=best.impulse,
+            velocity=best.velocity,
+            residuals=best.residuals,
+            iterations=self.iterations,
+            products=self.products,
+            factorisations=self.factorisations,
+            refinements=self.refinements,
+            factor_entries=self.factor_entries,
+            linear_residual=self.linear_residual,
+            outer=self.outer,
+            seconds=dict(self.seconds),
+            history=np.array(self.history),
+            lipschitz=lipschitz,
+            converged=converged,
+            reason="converged" if converged else reason,
+        )
