@@ -264,7 +264,8 @@ class _VelocityForm:
         self._operator.apply(x, rest)
         np.subtract(self._s, rest, out=rest)
         rest -= self._y
-        rest[self._frictionless, 1:] = 0.0
+        if rest.shape[1] > 1:
+            rest[self._frictionless, 1:] = 0.0
 
     def destroy(self) -> None:
         self.solver.destroy()
@@ -274,7 +275,103 @@ class _VelocityForm:
 
 
 class _ContactForm:
-    """N + R as one matrix."""
+    """N + R as one matrix; N is formed once for each geometry."""
+
+    def __init__(
+        self, operator: Any, mu: NDArray, parallel: Parallel, options: NewtonOptions
+    ) -> None:
+        from petsc4py import PETSc
+
+        self._petsc, self._parallel = PETSc, parallel
+        self._columns = operator.columns
+        self._symmetric = getattr(operator, "symmetric", True)
+        self._graph = _graph_of(operator, parallel)
+        self._take_geometry(operator, mu)
+        self._matrix = self._N.duplicate(copy=True)
+        self._mark()
+        self.solver = _linear_solver(
+            self._matrix, self._columns, self._symmetric, options, parallel
+        )
+        self._b, self._x = self._matrix.createVecs()
+
+    def take(self, operator: Any, mu: NDArray) -> bool:
+        graph = _graph_of(operator, self._parallel)
+        if graph is None:
+            same = operator is self._operator
+        else:
+            same = self._graph is not None and self._graph.same(graph)
+        if self._parallel.any(not (same and operator.columns == self._columns)):
+            return False
+        self._N.destroy()
+        self._take_geometry(operator, mu)
+        return True
+
+    def _take_geometry(self, operator: Any, mu: NDArray) -> None:
+        """Collective. N, with zeros in the rows and columns of tangents without friction."""
+        self._operator = operator
+        self._frictionless = _frictionless_rows(mu, operator)
+        self._N = operator.delassus()
+        # The blocks of R must have their place, also where N happens to have none.
+        zeros, self._indptr, self._indices = _block_diagonal(
+            self._N, self._columns, self._petsc, self._parallel
+        )
+        self._N.axpy(1.0, zeros, structure=self._petsc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        zeros.destroy()
+        mask = self._N.createVecLeft()
+        ones = np.ones((mask.getLocalSize() // self._columns, self._columns))
+        mask.getArray()[:] = _without_tangents(ones, self._frictionless).ravel()
+        self._N.diagonalScale(mask, mask)
+        mask.destroy()
+
+    def _mark(self) -> None:
+        if self._symmetric:
+            self._matrix.setOption(self._petsc.Mat.Option.SPD, True)
+
+    def masked(self, s: NDArray) -> NDArray:
+        return _without_tangents(s, self._frictionless)
+
+    def factor(self, Q: NDArray, R: NDArray) -> None:
+        if R.shape[1] > 1 and self._frictionless.size:
+            R = R.copy()
+            R[self._frictionless, 1:, :] = 0.0
+            R[self._frictionless, :, 1:] = 0.0
+            R[self._frictionless, 1, 1] = 1.0
+            R[self._frictionless, 2, 2] = 1.0
+        self._R = R
+        self._N.copy(self._matrix, structure=self._petsc.Mat.Structure.SAME_NONZERO_PATTERN)
+        add = self._petsc.InsertMode.ADD_VALUES
+        self._matrix.setValuesCSR(self._indptr, self._indices, R.ravel(), addv=add)
+        self._matrix.assemble()
+        self._mark()
+        self.solver.set_up()
+
+    def begin(self, s: NDArray) -> None:
+        self._s, self._work = s, np.empty_like(s)
+
+    def correct(self, rest: NDArray, x: NDArray, tolerance: float) -> int:
+        self._b.getArray()[:] = rest.ravel()
+        iterations = self.solver.solve(self._b, self._x, tolerance)
+        x += self._x.getArray(readonly=True).reshape(x.shape)
+        return iterations
+
+    def residual(self, x: NDArray, rest: NDArray) -> None:
+        self._operator.apply(x, rest)
+        kernels.block_product.serial(self._R, x, self._work)
+        rest += self._work
+        np.subtract(self._s, rest, out=rest)
+        if rest.shape[1] > 1:
+            rest[self._frictionless, 1:] = 0.0
+
+    def destroy(self) -> None:
+        self.solver.destroy()
+        for item in (self._matrix, self._N, self._b, self._x):
+            item.destroy()
+
+
+def _graph_of(operator: Any, parallel: Parallel) -> _Graph | None:
+    """Collective. The contact graph, None of a problem that comes as matrices."""
+    known = isinstance(operator, MatrixFree | Assembled)
+    return _Graph.of(operator, parallel) if known else None
 
 
 # ---- the matrix of the velocity form -------------------------------------------------------
@@ -406,11 +503,72 @@ class _ContactVelocityMatrix:
         self.matrix.destroy()
 
 
+class _ProductVelocityMatrix:
+    """K = M + H Q H^T of a problem that comes as sparse matrices H^T and M."""
+
+    block = 1
+
+    def __init__(self, operator: Any, parallel: Parallel) -> None:
+        """Collective."""
+        from petsc4py import PETSc
+
+        self._petsc, self._operator = PETSc, operator
+        self._symmetric = operator.symmetric
+        self._H_t, self._M = operator.velocity_factors()
+        self._Q, self._indptr, self._indices = _block_diagonal(
+            self._H_t, operator.columns, PETSc, parallel
+        )
+        self._product = self._Q.ptap(self._H_t)
+        self.matrix = self._product.duplicate(copy=True)
+        self.matrix.axpy(1.0, self._M, structure=PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        self._mark()
+
+    def _mark(self) -> None:
+        if self._symmetric:
+            self.matrix.setOption(self._petsc.Mat.Option.SPD, True)
+
+    def take(self, operator: Any) -> bool:
+        """Return whether this is still the same problem."""
+        return operator is self._operator
+
+    def fill(self, Q: NDArray) -> None:
+        """Collective. Give the matrix its values for Q (m, c, c)."""
+        self._Q.setValuesCSR(self._indptr, self._indices, Q.ravel())
+        self._Q.assemble()
+        self._Q.ptap(self._H_t, result=self._product)
+        within = self._petsc.Mat.Structure.SUBSET_NONZERO_PATTERN
+        self.matrix.zeroEntries()
+        self.matrix.axpy(1.0, self._product, structure=within)
+        self.matrix.axpy(1.0, self._M, structure=within)
+        self._mark()
+
+    def destroy(self) -> None:
+        """Collective."""
+        for item in (self.matrix, self._product, self._Q, self._M):
+            item.destroy()
+
+
+def _block_diagonal(
+    like: Any, c: int, petsc: Any, parallel: Parallel
+) -> tuple[Any, NDArray, NDArray]:
+    """Collective. A matrix of c x c zero blocks over the rows of `like`, and its CSR pattern."""
+    rows, first = like.getLocalSize()[0], like.getOwnershipRange()[0]
+    index = petsc.IntType
+    indptr = np.arange(0, rows * c + 1, c, dtype=index)
+    columns = first + np.arange(rows, dtype=index).reshape(-1, 1, c)
+    indices = np.broadcast_to(columns, (rows // c, c, c)).astype(index).ravel()
+    sizes = ((rows, None), (rows, None))
+    csr = (indptr, indices, np.zeros(rows * c))
+    return petsc.Mat().createAIJ(sizes, csr=csr, comm=parallel.communicator), indptr, indices
+
+
 # ---- choices -------------------------------------------------------------------------------
 
 
 def _choose_form(operator: Any, options: NewtonOptions) -> Literal["velocity", "contact"]:
-    return "velocity"
+    if options.form != "auto":
+        return options.form
+    return "velocity" if hasattr(operator, "body_impulse") else "contact"
 
 
 def _linear_solver(

@@ -105,6 +105,16 @@ class MatrixFree:
         self.halo.forward(self._u)
         self.contact_velocity(self._u, out)
 
+    def delassus(self) -> Any:
+        """Collective. N as a new PETSc matrix; for problems that a direct solver can hold."""
+        assembled = Assembled(
+            self.contacts, self._inverse_mass, self._inverse_inertia, self.halo,
+            self.columns == 3, self.halo.parallel,
+        )  # fmt: skip
+        matrix = assembled.delassus()
+        assembled.destroy()
+        return matrix
+
     @property
     def freedoms(self) -> int:
         """Degrees of freedom of a body, 6 or 3."""
@@ -260,6 +270,13 @@ class Assembled:
     def relative_velocity(self, u: NDArray, out: NDArray) -> None:
         """Collective. out = D^T u for velocities of the owned bodies u (n, 6 or 3)."""
         self.contact_velocity(u, out)
+
+    def delassus(self) -> Any:
+        """Collective. N = D^T M^-1 D as a new PETSc matrix."""
+        D = self.d_transposed.transpose(self._petsc.Mat())
+        matrix = self.inverse_mass.ptap(D)
+        D.destroy()
+        return matrix
 
     @property
     def freedoms(self) -> int:

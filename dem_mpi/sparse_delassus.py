@@ -40,6 +40,7 @@ class MatrixDelassus:
         self.asymmetry = checked_asymmetry(W, rows, f"{problem.path}: W", parallel)
         self.entries = parallel.sum(int(W.nnz))
         self.description = f"W with {self.entries} entries"
+        self.columns = COLUMNS
         self._diagonal = _diagonal(W, rows).reshape(-1, COLUMNS)
         _check_contacts(self._diagonal, problem, parallel)
         self._W = _matrix(W, rows.count, parallel)
@@ -51,6 +52,10 @@ class MatrixDelassus:
         self._r.getArray()[:] = impulse.ravel()
         self._W.mult(self._r, self._u)
         out[:] = self._u.getArray(readonly=True).reshape(out.shape)
+
+    def delassus(self) -> PETSc.Mat:
+        """Collective. W as a new PETSc matrix."""
+        return self._W.copy()
 
     @property
     def symmetric(self) -> bool:
@@ -76,6 +81,8 @@ class FactoredDelassus:
         label = f"{problem.path}: M"
         M = problem.mass
         self.asymmetry = checked_asymmetry(M, bodies, label, parallel)
+        self.columns = COLUMNS
+        self._mass_rows, self._bodies, self._parallel = M, bodies, parallel
         H_t = problem.jacobian
         block = _block_size(M, bodies, parallel)
         self._mass: _MassInverse = (
@@ -120,6 +127,34 @@ class FactoredDelassus:
         self._mass.solve(self._p, self._v)
         return self._v.getArray().copy()
 
+    def body_impulse(self, impulse: NDArray) -> NDArray:
+        """Collective. H impulse, the components this rank owns."""
+        self._r.getArray()[:] = impulse.ravel()
+        self._H_t.multTranspose(self._r, self._p)
+        return self._p.getArray(readonly=True)
+
+    def relative_velocity(self, v: NDArray, out: NDArray) -> None:
+        """Collective. out = H^T v for the components of v that this rank owns."""
+        self._v.getArray()[:] = v.ravel()
+        self._H_t.mult(self._v, self._u)
+        out[:] = self._u.getArray(readonly=True).reshape(out.shape)
+
+    def delassus(self) -> PETSc.Mat:
+        """Collective. W = H^T M^-1 H as a new matrix. DemError if M is known by a factor alone."""
+        if self._mass.matrix is None:
+            raise DemError(
+                "W = H^T M^-1 H cannot be formed: M is not block-diagonal, so M^-1 is dense; "
+                "solve for the velocities (contact.scip.form: velocity)"
+            )
+        H = self._H_t.transpose(PETSc.Mat())
+        W = self._mass.matrix.ptap(H)
+        H.destroy()
+        return W
+
+    def velocity_factors(self) -> tuple[PETSc.Mat, PETSc.Mat]:
+        """Collective. H^T, which stays this object's, and M as a new matrix."""
+        return self._H_t, _matrix(self._mass_rows, self._bodies.count, self._parallel)
+
     @property
     def symmetric(self) -> bool:
         """Whether M is symmetric up to round-off."""
@@ -140,6 +175,7 @@ class FactoredDelassus:
 
 class _MassInverse(Protocol):
     description: str
+    matrix: PETSc.Mat | None  # M^-1 where it is sparse
 
     def solve(self, p: PETSc.Vec, v: PETSc.Vec) -> None:
         """Collective. v = M^-1 p."""
@@ -177,28 +213,29 @@ class _BlockInverse:
         rows = sparse.csr_matrix(
             (inverse.ravel(), columns, indptr), shape=(bodies.count, bodies.total)
         )
-        self._inverse = _matrix(rows, bodies.count, parallel)
+        self.matrix = _matrix(rows, bodies.count, parallel)
         self.description = (
             "M diagonal" if block == 1 else f"M block-diagonal ({block} by {block} blocks)"
         )
 
     def solve(self, p: PETSc.Vec, v: PETSc.Vec) -> None:
-        self._inverse.mult(p, v)
+        self.matrix.mult(p, v)
 
     def diagonal(self, H_t: PETSc.Mat, rows: sparse.csr_matrix) -> NDArray:
-        product = H_t.matMult(self._inverse)
+        product = H_t.matMult(self.matrix)
         local = _local_rows(product, rows.shape[1])
         product.destroy()
         return np.asarray(local.multiply(rows).sum(axis=1)).ravel()
 
     def destroy(self) -> None:
-        self._inverse.destroy()
+        self.matrix.destroy()
 
 
 class _DirectInverse:
     """M^-1 by a factorisation of M with MUMPS, made once."""
 
     description = "M factorised"
+    matrix = None
 
     def __init__(
         self,
