@@ -66,8 +66,11 @@ def save(records: list[Record], path: Path | None) -> None:
         path.write_text(json.dumps([asdict(r) for r in records], indent=1) + "\n")
 
 
-def mpirun(ranks: int, command: list[str]) -> None:
-    """Run this interpreter with `command` on so many ranks, one thread each; raise if it fails."""
+def mpirun(ranks: int, command: list[str], limit: float | None = None) -> None:
+    """Run this interpreter with `command` on so many ranks, one thread each; raise if it fails.
+
+    After `limit` seconds mpirun is told to end its ranks, and TimeoutExpired raised.
+    """
     environment = {
         **os.environ,
         "OMP_NUM_THREADS": "1",
@@ -82,4 +85,11 @@ def mpirun(ranks: int, command: list[str]) -> None:
     if os.geteuid() == 0:
         environment |= {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     call = ["mpirun", "--quiet", "-n", str(ranks), sys.executable, *command]
-    subprocess.run(call, check=True, env=environment, cwd=ROOT)
+    with subprocess.Popen(call, env=environment, cwd=ROOT) as process:
+        try:
+            code = process.wait(limit)
+        except BaseException:
+            process.terminate()
+            raise
+    if code:
+        raise subprocess.CalledProcessError(code, call)
