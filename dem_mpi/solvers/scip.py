@@ -1,0 +1,393 @@
+"""Primal-dual interior point method on symmetric cones for the cone complementarity problem.
+
+Nesterov-Todd scaling, predictor and corrector of Mehrotra, centrality correctors of Gondzio,
+infeasible start (S. De, thesis 2021, 2.3.2, with a scaling that keeps the system symmetric). An
+iteration costs one factorisation, and a few solves and products with N.
+
+x = T gamma and y = T^-1 g with T = diag(1, 1/mu, 1/mu) are in the cone {x_n >= |x_t|}; the central
+path x_i o y_i = target e, on which gamma_i.g_i = target, leads to the solution as target -> 0. x,
+and so gamma, is strictly inside its cone at every iterate. y is an unknown of its own: what parts
+it from T^-1 (N gamma + b) falls by 1 - alpha with every step alpha. Without friction a cone is the
+half-line x_n >= 0, by the same formulas.
+
+Symbols: lambda, W, u, v, c, s as in `_kernels_scip`; mu-hat, here `mean`, is x.y per contact.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from time import perf_counter
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dem_mpi import _kernels_scip as kernels
+from dem_mpi._kernels_solver import CHUNK, project
+from dem_mpi.cone import ConeProblem, Delassus, Residuals, Tolerance, evaluate, largest_of_ranks
+from dem_mpi.newton import LinearSolve, NewtonFailureError, NewtonOptions, NewtonSystem
+from dem_mpi.parallel import Parallel
+from dem_mpi.solvers.result import SolveReport
+
+# The start lies on the central path where x.y is this times the mean squared violation over N_nn:
+# impulses of force chains are an order larger than those that stop single bodies.
+_START = 100.0
+# Centrality correctors: what they aim at beyond the step there is, and the products x o y, over
+# their target, that they leave as they are.
+_LONGER = 0.3
+_BAND = (0.1, 10.0)
+_WORTHWHILE = 1.01  # a corrector that does not lengthen the step by this factor is the last
+# A direction is refined until what it leaves of its equation, in units of the scaled point, is this
+# part; later iterations need it, as the condition of W grows with 1/mean.
+_MISFIT = 1e-3
+_REFINEMENTS = 4
+_LOOSE = 1e-6  # relative residual asked of a linear solve: the refinement here does the rest
+_POOR_STEP = 0.05  # below it the direction of plain centring is tried instead
+_TINY_STEP = 1e-4
+_PATIENCE = 5  # tiny steps, or iterations without progress, in a row
+
+
+class System(Protocol):
+    """(N + R) dgamma = s with R block-diagonal: what `NewtonSystem` offers."""
+
+    form: str
+
+    @property
+    def factor_entries(self) -> int: ...
+
+    def take(self, operator: Any, mu: NDArray) -> bool: ...
+
+    def factor(self, Q: NDArray, R: NDArray) -> None: ...
+
+    def solve(self, s: NDArray, out: NDArray, tolerance: float = ...) -> LinearSolve: ...
+
+    def destroy(self) -> None: ...
+
+
+@dataclass(frozen=True)
+class ScipOptions:
+    """Options of `Scip`.
+
+    max_iterations : factorisations
+    correctors     : largest number of centrality correctors an iteration; each costs a solve
+    """
+
+    tolerance: Tolerance = field(default_factory=Tolerance)
+    max_iterations: int = 60
+    newton: NewtonOptions = field(default_factory=NewtonOptions)
+    correctors: int = 3
+
+
+class Scip:
+    """Solves a `ConeProblem` by an interior point method; keeps its Newton system for the next."""
+
+    def __init__(
+        self,
+        options: ScipOptions | None = None,
+        make_system: Callable[[Any, NDArray, Parallel, NewtonOptions], System] = NewtonSystem,
+    ) -> None:
+        self.options = options or ScipOptions()
+        self._make_system = make_system
+        self._system: System | None = None
+
+    def solve(
+        self,
+        problem: ConeProblem,
+        guess: NDArray,
+        lipschitz: float | None = None,
+        tolerance: Tolerance | None = None,
+    ) -> SolveReport:
+        """Collective. Follow the central path from near `guess` (m, columns) [N s].
+
+        `tolerance` takes the place of the one in the options for this problem. Returns the best
+        iterate seen, with the reason in words when it did not converge. Rows of the guess that are
+        not finite start from zero. The guess is taken over, not copied. `lipschitz` is passed on.
+        """
+        started = perf_counter()
+        run = _Run(problem, tolerance or self.options.tolerance)
+        gamma = np.ascontiguousarray(guess, dtype=np.float64)
+        gamma[~np.isfinite(gamma).all(axis=1)] = 0.0
+        project.using(problem.threads)(gamma, problem.mu)
+        reason = "converged"
+        run.judge(gamma)
+        if run.contacts and not run.best_merit <= 1.0:
+            try:
+                with run.timed("assemble"):
+                    system = self._system_for(problem)
+                path = _CentralPath(problem, system, run)
+                reason = self._follow(path, run, gamma)
+            except NewtonFailureError as error:
+                reason = str(error)
+        return run.report(reason, lipschitz, self._system, perf_counter() - started)
+
+    def destroy(self) -> None:
+        """Collective. Free the Newton system."""
+        if self._system is not None:
+            self._system.destroy()
+            self._system = None
+
+    def _system_for(self, problem: ConeProblem) -> System:
+        """Collective. The Newton system of this problem: the kept one if its graph stands."""
+        if self._system is not None and not self._system.take(problem.operator, problem.mu):
+            self.destroy()
+        if self._system is None:
+            self._system = self._make_system(
+                problem.operator, problem.mu, problem.parallel, self.options.newton
+            )
+        return self._system
+
+    def _follow(self, path: _CentralPath, run: _Run, gamma: NDArray) -> str:
+        """Collective. Iterate to the tolerance; return why it ended. `gamma` becomes the iterate.
+
+        Every decision is taken from numbers that are alike on all ranks.
+        """
+        path.start(gamma, run.g)
+        tiny, stalled, least_mean = 0, 0, math.inf
+        for iteration in range(self.options.max_iterations + 1):
+            path.impulse(gamma)
+            improved = run.judge(gamma)
+            if run.best_merit <= 1.0:
+                return "converged"
+            if not path.rescale(run.g):
+                return "not a number in the iteration, or rounding left the cones"
+            stalled = 0 if improved or path.mean < 0.9 * least_mean else stalled + 1
+            least_mean = min(least_mean, path.mean)
+            if stalled >= _PATIENCE:
+                return "stalled: neither the residuals nor the complementarity fall any more"
+            if iteration == self.options.max_iterations:
+                break
+            run.iterations += 1
+            step = path.advance(self.options.correctors)
+            if not math.isfinite(step):
+                return "not a number in the Newton step"
+            tiny = tiny + 1 if step < _TINY_STEP else 0
+            if tiny >= _PATIENCE:
+                return "the steps became too small"
+        return "reached the iteration limit"
+
+
+class _Run:
+    """What a solve counts, times and keeps: the best iterate by the merit of fresh products."""
+
+    def __init__(self, problem: ConeProblem, tolerance: Tolerance) -> None:
+        """Collective."""
+        self.problem, self.tolerance = problem, tolerance
+        self.contacts = problem.parallel.sum(problem.contacts)
+        self.g = np.empty_like(problem.b)
+        self.best, self.best_merit = np.zeros_like(problem.b), math.inf
+        self.history: list[tuple[float, ...]] = []
+        self.iterations = self.products = self.factorisations = self.refinements = 0
+        self.linear_residual = 0.0
+        self.seconds = {"solve": 0.0, "assemble": 0.0, "factor": 0.0, "substitute": 0.0}
+
+    @contextmanager
+    def timed(self, phase: str) -> Iterator[None]:
+        started = perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[phase] += perf_counter() - started
+
+    def judge(self, gamma: NDArray) -> bool:
+        """Collective. g = N gamma + b; note the residuals; whether gamma is the best so far."""
+        residuals = self._evaluate(gamma)
+        # The first row is the guess; the point that the path starts from gets none.
+        if self.iterations >= len(self.history):
+            self.history.append(
+                (self.iterations, residuals.dual, residuals.complementarity, residuals.objective)
+            )
+        merit = self.tolerance.merit(residuals, self.problem) if residuals.finite else math.inf
+        better = merit < self.best_merit
+        if better:
+            self.best[:] = gamma
+            self.best_merit = merit
+        return better
+
+    def _evaluate(self, gamma: NDArray) -> Residuals:
+        self.problem.operator.apply(gamma, self.g)
+        self.g += self.problem.b
+        self.products += 1
+        return evaluate(self.problem, gamma, self.g)
+
+    def report(
+        self, reason: str, lipschitz: float | None, system: System | None, seconds: float
+    ) -> SolveReport:
+        """Collective. The report of the best iterate."""
+        project.using(self.problem.threads)(self.best, self.problem.mu)
+        final = self._evaluate(self.best)
+        converged = final.finite and self.tolerance.merit(final, self.problem) <= 1.0
+        used = system if self.factorisations else None
+        return SolveReport(
+            impulse=self.best,
+            velocity=self.g,
+            residuals=final,
+            iterations=self.iterations,
+            products=self.products,
+            factorisations=self.factorisations,
+            history=np.array(self.history),
+            seconds=self.seconds | {"solve": seconds},
+            converged=converged,
+            reason="converged" if converged else reason,
+            lipschitz=lipschitz or 0.0,
+            solver="scip",
+            form=used.form if used else "",
+            factor_entries=used.factor_entries if used else 0,
+            linear_residual=self.linear_residual,
+            refinements=self.refinements,
+        )
+
+
+class _Direction:
+    """A Newton direction: impulse, N times it, and both parts in the scaled space."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.dgamma, self.dg = np.zeros(shape), np.zeros(shape)
+        self.u, self.v = np.zeros(shape), np.zeros(shape)
+        self.c = np.zeros(shape)
+        self.longest = 0.0
+
+
+class _CentralPath:
+    """The iterate (x, y) of one solve, and its steps."""
+
+    def __init__(self, problem: ConeProblem, system: System, run: _Run) -> None:
+        self._problem, self._system, self._run = problem, system, run
+        m, columns = shape = problem.b.shape
+        self._x, self._y = np.empty(shape), np.empty(shape)
+        self._eta, self._w, self._lam = np.empty(m), np.empty(shape), np.empty(shape)
+        self._Q, self._R = np.zeros((m, columns, columns)), np.zeros((m, columns, columns))
+        self._now, self._trial = _Direction(shape), _Direction(shape)
+        self._s, self._correction = np.empty(shape), np.zeros(shape)
+        chunks = max(1, math.ceil(m / CHUNK))
+        self._partial = [np.zeros(chunks), np.zeros((chunks, 2)), np.zeros((chunks, 3))]
+        self._g = run.g
+        self.mean = math.inf
+
+    def start(self, gamma: NDArray, g: NDArray) -> None:
+        """Collective. A point of the central path near gamma (in its cone) and its g."""
+        mu = self._problem.mu
+        stiffness = self._problem.operator.diagonal()[:, 0].copy()
+        total = self._kernel(kernels.distance)(gamma, g, mu, stiffness, self._partial[0])
+        target = _START * self._problem.parallel.sum(total) / self._run.contacts
+        self._kernel(kernels.centred_start)(gamma, g, mu, stiffness, target, self._x, self._y)
+
+    def impulse(self, gamma: NDArray) -> None:
+        """gamma = T^-1 x."""
+        self._kernel(kernels.impulse)(self._x, self._problem.mu, gamma)
+
+    def rescale(self, g: NDArray) -> bool:
+        """Collective. Scaling at the iterate, whose N gamma + b is g; False if it is no longer one.
+
+        Sets `mean`, x.y per contact.
+        """
+        self._g = g
+        gap, least, _ = self._kernel(kernels.scaling)(
+            self._x, self._y, self._problem.mu, g, self._eta, self._w, self._lam, self._partial[2]
+        )
+        found = np.array([-least if self._problem.contacts else np.inf, gap])
+        self.mean = self._problem.parallel.sum(gap) / self._run.contacts
+        bad = not math.isfinite(gap) or math.isnan(found[0]) or not self.mean > 0.0
+        return not self._problem.parallel.any(bad)
+
+    def advance(self, correctors: int) -> float:
+        """Collective. Factorise, find a direction, step; return the step, NaN if there is none."""
+        run, now = self._run, self._now
+        with run.timed("factor"):
+            self._kernel(kernels.blocks)(self._eta, self._w, self._problem.mu, self._Q, self._R)
+            self._system.factor(self._Q, self._R)
+            run.factorisations += 1
+        now.c[:] = 0.0
+        self._find(now)
+        affine = min(1.0, now.longest)
+        target = self._target(now, affine)
+        self._kernel(kernels.second_order)(self._lam, now.u, now.v, target, now.c)
+        self._find(now)
+        for _ in range(correctors):
+            if not self._corrected(target):
+                break
+        if now.longest < _POOR_STEP:
+            self._centred()
+        now = self._now
+        step = min(1.0, now.longest * (0.9 + 0.09 * min(now.longest, 1.0)))
+        if math.isfinite(step):
+            self._kernel(kernels.advance)(
+                self._x, self._y, now.dgamma, now.dg, self._g, self._problem.mu, step, step
+            )
+        return step
+
+    def _target(self, now: _Direction, affine: float) -> float:
+        """Collective. Where on the central path to aim (S. Mehrotra, 1992)."""
+        gap = self._kernel(kernels.gap_at)(
+            self._lam, now.u, now.v, affine, affine, self._partial[0]
+        )
+        ratio = self._problem.parallel.sum(gap) / self._run.contacts / self.mean
+        return self.mean * min(1.0, max(0.0, ratio)) ** 3
+
+    def _corrected(self, target: float) -> bool:
+        """Collective. Try for a longer step; whether that succeeded."""
+        now, trial = self._now, self._trial
+        if not now.longest < 1.0:
+            return False
+        trial.c[:] = now.c
+        low, high = _BAND
+        self._kernel(kernels.centrality)(
+            self._lam, now.u, now.v, min(1.0, now.longest + _LONGER), low * target, high * target,
+            trial.c,
+        )  # fmt: skip
+        self._find(trial)
+        if not min(trial.longest, 1.0) >= _WORTHWHILE * now.longest:
+            return False
+        self._now, self._trial = trial, now
+        return True
+
+    def _centred(self) -> None:
+        """Collective. Take the direction towards the point of the central path at this `mean`."""
+        trial = self._trial
+        trial.u[:] = 0.0
+        trial.v[:] = 0.0
+        self._kernel(kernels.second_order)(self._lam, trial.u, trial.v, self.mean, trial.c)
+        self._find(trial)
+        if not trial.longest <= self._now.longest:
+            self._now, self._trial = trial, self._now
+
+    def _find(self, d: _Direction) -> None:
+        """Collective. Solve for d's right-hand side c, refined in the scaled space."""
+        kernel, mu, partial = self._kernel, self._problem.mu, self._partial
+        kernel(kernels.right_side)(self._g, self._eta, self._w, mu, d.c, self._s)
+        self._solve(d.dgamma)
+        last = math.inf
+        for attempt in range(_REFINEMENTS + 1):
+            self._problem.operator.apply(d.dgamma, d.dg)
+            self._run.products += 1
+            primal, dual = kernel(kernels.direction)(
+                d.dgamma, d.dg, self._g, self._y, self._eta, self._w, self._lam, mu, d.u, d.v,
+                partial[1],
+            )  # fmt: skip
+            worst = kernel(kernels.misfit)(
+                self._lam, d.u, d.v, self._eta, self._w, mu, d.c, self._s, partial[0]
+            )
+            found = np.array([primal, dual, worst])
+            largest_of_ranks(found, self._problem.parallel)
+            misfit = found[2] / math.sqrt(self.mean)
+            blocking = max(found[0], found[1])
+            d.longest = 1.0 / blocking if blocking > 0.0 else math.inf
+            if not _MISFIT < misfit < 0.5 * last or attempt == _REFINEMENTS:
+                return
+            last = misfit
+            self._run.refinements += 1
+            self._solve(self._correction)
+            d.dgamma += self._correction
+
+    def _solve(self, out: NDArray) -> None:
+        run = self._run
+        with run.timed("substitute"):
+            done = self._system.solve(self._s, out, _LOOSE)
+        run.linear_residual = max(run.linear_residual, done.residual)
+        run.refinements += done.refinements
+        run.products += done.products
+
+    def _kernel(self, kernel: Any) -> Callable:
+        return kernel.using(self._problem.threads)
