@@ -150,7 +150,7 @@ def pieces(quick: bool) -> list[Piece]:
                 add("precision", state, method, ranks, *LADDER, truth=True)
             for method in ("apgd cold", "apgd warm"):
                 add("precision", state, method, ranks, *LADDER[: 5 if quick else 6], truth=True)
-        add("precision", state, "clarabel", 1, 1e-3, 1e-5, 1e-7, 1e-9, 1e-11, truth=True)
+        add("precision", state, "clarabel", 1, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10, truth=True)
 
     if not quick:
         state = "pile-100000/settled"
@@ -255,7 +255,7 @@ def records_of(known: Known) -> list[Record]:
 def _row_records(piece: Piece, row: dict[str, Any], params: dict[str, Any]) -> list[Record]:
     keys = ("tolerance", "converged", "r_d", "r_c", "thesis", "objective", "velocity_error",
             "form", "factor_entries", "linear_residual", "refinements", "memory", "outer", "to",
-            "phases")  # fmt: skip
+            "products", "phases")  # fmt: skip
     params = params | {k: row[k] for k in keys if k in row}
     params |= {"kind": piece.kind, **dict(piece.more)}
     error = row.get("velocity_error", row["r_d"])
@@ -469,7 +469,8 @@ def _thesis_table(known: Known) -> str:
             continue
         solver = METHODS[piece.method]["solver"]
         last = found["rows"][-1]
-        counts = {row["tolerance"]: row["iterations"] for row in found["rows"]}
+        counts = {float(tau): n for tau, n in last["to"].get("thesis", {}).items()}
+        counts |= {row["tolerance"]: row["iterations"] for row in found["rows"]}
         theirs = DE[(solver, found["spheres"])]
         cells = [
             f"{_number(counts.get(tau), 5)} / {de}" for tau, de in zip(THESIS, theirs, strict=True)

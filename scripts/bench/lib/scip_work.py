@@ -11,7 +11,7 @@ by impulses that are too large, and by all iterates of some methods.
 from __future__ import annotations
 
 import statistics
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -94,14 +94,16 @@ def _ours(
 ) -> dict[str, Any]:
     """Collective. Solve to one tolerance some times with solvers made anew; one row."""
     parallel, seconds = problem.parallel, []
-    options = _options(task, criterion(problem, tolerance, task.get("kind", "both")))
+    stop = criterion(problem, tolerance, task.get("kind", "both"))
+    options = _options(task, stop)
     for _ in range(task.get("runs", 1)):
         solver, before = make_solver(options), resident_memory()
+        stop.seen.clear()
         parallel.barrier()
         began = perf_counter()
         report = solver.solve(problem, guess * (task.get("start", "cold") == "warm"))
         seconds.append(parallel.max(perf_counter() - began))
-        memory = parallel.sum(peak_memory() - before)
+        memory = parallel.sum(max(peak_memory() - before, 0))
         solver.destroy()
     row = {
         "tolerance": tolerance,
@@ -119,25 +121,45 @@ def _ours(
         "linear_residual": report.linear_residual,
         "refinements": report.refinements,
         "memory": memory,
-        "to": iterations_to(report, problem) if task.get("law", "ccp") == "ccp" else {},
+        "to": {},
         **_residuals(report.residuals),
     }
+    if task.get("law", "ccp") == "ccp":
+        row["to"] = iterations_to(report, problem, stop.seen)
     return row | _velocities(simulation, problem, report.impulse, task)
 
 
-def criterion(problem: ConeProblem, value: float, kind: str) -> Tolerance:
+@dataclass(frozen=True)
+class Watching(Tolerance):
+    """A tolerance that notes S. De's measure of each iterate that is put before it."""
+
+    seen: list[float] = field(default_factory=list)
+
+    def merit(self, residuals: Residuals, problem: ConeProblem) -> float:
+        self.seen.append(residuals.thesis)
+        return super().merit(residuals, problem)
+
+
+def criterion(problem: ConeProblem, value: float, kind: str) -> Watching:
     """When a solve stops: "both" residuals below value, or S. De's measure, "thesis"."""
     if kind == "thesis":
-        return Tolerance(value, kind="thesis")
-    return Tolerance(value, relative_work=value / problem.velocity_scale)
+        return Watching(value, kind="thesis")
+    return Watching(value, relative_work=value / problem.velocity_scale)
 
 
-def iterations_to(report: SolveReport, problem: ConeProblem) -> dict[str, dict[str, int]]:
-    """Iterations after which r_d alone, or both residuals, were first below each decade."""
+def iterations_to(
+    report: SolveReport, problem: ConeProblem, seen: list[float]
+) -> dict[str, dict[str, int]]:
+    """Iterations after which r_d alone, or both residuals, were first below each decade.
+
+    S. De's measure too, where the solver put every iterate before the tolerance.
+    """
     iteration, dual, work = report.history[:, :3].T
-    both = np.maximum(dual, work / problem.impulse_scale)
-    found: dict[str, dict[str, int]] = {"dual": {}, "both": {}}
-    for name, residual in (("dual", dual), ("both", both)):
+    measures = {"dual": dual, "both": np.maximum(dual, work / problem.impulse_scale)}
+    if len(iteration) <= len(seen) <= len(iteration) + 1:  # once more for the result
+        measures["thesis"] = np.array(seen[: len(iteration)])
+    found: dict[str, dict[str, int]] = {name: {} for name in measures}
+    for name, residual in measures.items():
         for decade in DECADES:
             reached = np.flatnonzero(residual <= decade)
             if len(reached):
@@ -218,7 +240,7 @@ def _rival(
         "iterations": solved.iterations,
         "converged": solved.converged,
         "reason": solved.status,
-        "memory": peak_memory() - before,
+        "memory": max(peak_memory() - before, 0),
         **_residuals(law(problem, impulse, g)),
     }
     return row | _velocities(simulation, problem, impulse, task)
