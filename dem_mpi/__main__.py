@@ -186,9 +186,47 @@ def solve(
         float,
         typer.Option("--complementarity", help="Limit of |impulse . velocity| in v_ref gamma_ref."),
     ] = 1e-6,
+    solver: Annotated[
+        str,
+        typer.Option(
+            "--solver",
+            metavar="apgd|scip|auto",
+            help="apgd: first order; scip: interior point; auto: apgd, then scip where that "
+            "promises less work.",
+        ),
+    ] = "apgd",
+    law: Annotated[
+        str,
+        typer.Option(
+            "--law",
+            metavar="ccp|coulomb",
+            help="coulomb: what FCLIB states; ccp: its convex relaxation, as in a simulation.",
+        ),
+    ] = "ccp",
     max_iterations: Annotated[
-        int, typer.Option("--max-iterations", min=0, help="Stop, not converged, after so many.")
+        int,
+        typer.Option("--max-iterations", min=0, help="Stop apgd, not converged, after so many."),
     ] = 100_000,
+    newton_iterations: Annotated[
+        int,
+        typer.Option("--newton-iterations", min=1, help="Stop scip, not converged, after so many."),
+    ] = 60,
+    form: Annotated[
+        str,
+        typer.Option(
+            "--form",
+            metavar="auto|velocity|contact",
+            help="Unknowns of scip's linear systems; a local problem has contact only.",
+        ),
+    ] = "auto",
+    linear: Annotated[
+        str,
+        typer.Option(
+            "--linear",
+            metavar="mumps|cg",
+            help="scip's linear systems by factors, or by conjugate gradients.",
+        ),
+    ] = "mumps",
     guess: Annotated[
         str | None,
         typer.Option(
@@ -210,15 +248,31 @@ def solve(
 ) -> None:
     """Solve an FCLIB problem: mpirun -n P dem-mpi solve PROBLEM.h5.
 
-    PROBLEM.h5 is local (W, q, mu) or global (M, H, f, w, mu). Prints iterations, residuals,
-    objective and seconds, and how stored impulses compare. Ends with 0 if the tolerance holds and
-    with 70 if it does not. There is no checkpoint of a solve: a signal ends it at once.
+    PROBLEM.h5 is local (W, q, mu) or global (M, H, f, w, mu). Prints iterations, the residuals of
+    the chosen law, objective and seconds, and how stored impulses compare under that law. Ends with
+    0 if the tolerance holds and with 70 if it does not. There is no checkpoint of a solve: a signal
+    ends it at once.
     """
     from dem_mpi.parallel import Parallel
-    from dem_mpi.solve import end_on_signals, parse_options, solve_file
+    from dem_mpi.solve import SolveOptions, end_on_signals, parse_options, solve_file
 
     end_on_signals(STOP)
-    options = parse_options(tolerance, kind, complementarity, max_iterations, guess, out, force)
+    options = parse_options(
+        tolerance,
+        kind,
+        complementarity,
+        SolveOptions(
+            max_iterations=max_iterations,
+            guess=guess,
+            out=out,
+            force=force,
+            solver=solver,
+            law=law,
+            newton_iterations=newton_iterations,
+            form=form,
+            linear=linear,
+        ),
+    )
     parallel = Parallel()
     parallel.install_abort_hook()
     raise typer.Exit(solve_file(parallel, problem, options, _print))

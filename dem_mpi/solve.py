@@ -1,9 +1,9 @@
 """`dem-mpi solve`: the contact problem of an FCLIB file, solved and reported.
 
-The problem solved is the cone complementarity problem of `cone`, the convex relaxation of what
-FCLIB states: gamma in C, g = W gamma + q in C*, gamma.g = 0, without the term mu |u_t| that FCLIB
-adds to the normal velocity. Both agree where no contact slides. A W that is not symmetric is taken
-as it is: gamma then minimises nothing, but the residuals say how well it solves the problem.
+Two laws: `coulomb` is what FCLIB states, gamma in C and g + (mu |g_t|, 0, 0) in C* orthogonal to
+each other, g = W gamma + q; `ccp` is its convex relaxation without the term mu |g_t|, the cone
+complementarity problem of `cone`. Both agree where no contact slides. A W that is not symmetric is
+taken as it is: gamma then minimises nothing, but the residuals say how well it solves the problem.
 
 Scales for the stop test, as in a simulation: v_ref = max_i |q_i| [m/s] (1 m/s if q = 0) and
 gamma_ref = v_ref / median(diag W) [N s].
@@ -14,13 +14,14 @@ from __future__ import annotations
 import math
 import signal
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from dem_mpi import __version__
 from dem_mpi.cone import (
@@ -33,17 +34,24 @@ from dem_mpi.cone import (
     median_of_positive,
 )
 from dem_mpi.errors import DemError, InputError
-from dem_mpi.fclib import COLUMNS, FclibProblem, read_problem
+from dem_mpi.fclib import COLUMNS, FclibProblem, Share, read_problem
 from dem_mpi.fclib_output import refuse_existing, write_result
 from dem_mpi.parallel import Parallel
+from dem_mpi.scene_models import Scip as ScipSection
 from dem_mpi.signals import StopRequest
-from dem_mpi.solvers.apgd import Apgd, ApgdOptions
+from dem_mpi.solvers.choice import SolverOptions, make_solver
+from dem_mpi.solvers.coulomb import law_residuals
 from dem_mpi.solvers.result import SolveReport
 
 if TYPE_CHECKING:
     from dem_mpi.sparse_delassus import FactoredDelassus, MatrixDelassus
 
 ToleranceKind = Literal["scaled", "absolute", "thesis"]
+Method = Literal["apgd", "scip", "auto"]
+Law = Literal["ccp", "coulomb"]
+Form = Literal["auto", "velocity", "contact"]
+Linear = Literal["mumps", "cg"]
+LAWS = {"ccp": "convex cone complementarity problem", "coulomb": "Coulomb's law"}
 NOT_CONVERGED = DemError.exit_code
 
 
@@ -51,6 +59,8 @@ NOT_CONVERGED = DemError.exit_code
 class SolveOptions:
     """What the command line asks for.
 
+    solver, law, form, linear : as in the contact section of a scene
+    max_iterations    : of apgd for a cone problem; newton_iterations : of scip
     guess : "solution" or the number of a guess of the file to start from; None starts from zero
     out   : file to write; force : replace it if it exists
     """
@@ -60,28 +70,47 @@ class SolveOptions:
     guess: str | None = None
     out: Path | None = None
     force: bool = False
+    solver: Method = "apgd"
+    law: Law = "ccp"
+    newton_iterations: int = 60
+    form: Form = "auto"
+    linear: Linear = "mumps"
+
+    @property
+    def choice(self) -> SolverOptions:
+        """What makes the solver."""
+        section = ScipSection(
+            max_iterations=self.newton_iterations, form=self.form, linear=self.linear
+        )
+        return SolverOptions(
+            self.solver, self.law, self.tolerance, self.max_iterations, scip=section
+        )
 
 
 def parse_options(
-    tolerance: float,
-    kind: str,
-    complementarity: float,
-    max_iterations: int,
-    guess: str | None,
-    out: Path | None,
-    force: bool,
+    tolerance: float, kind: str, complementarity: float, options: SolveOptions
 ) -> SolveOptions:
-    """Return the options of a command line; raises InputError for a value that breaks a rule."""
+    """Return `options` of a command line with its tolerance, all checked.
+
+    Raises InputError for a value that breaks a rule.
+    """
     for flag, value in (("--tolerance", tolerance), ("--complementarity", complementarity)):
         if not (math.isfinite(value) and value > 0.0):
             raise InputError(f"{flag} {value:g}: must be > 0 and finite")
-    kinds = get_args(ToleranceKind)
-    if kind not in kinds:
-        raise InputError(f"--tolerance-kind {kind}: must be one of {', '.join(kinds)}")
+    words = {
+        "--tolerance-kind": (kind, ToleranceKind),
+        "--solver": (options.solver, Method),
+        "--law": (options.law, Law),
+        "--form": (options.form, Form),
+        "--linear": (options.linear, Linear),
+    }
+    for flag, (value, known) in words.items():
+        if value not in get_args(known):
+            raise InputError(f"{flag} {value}: must be one of {', '.join(get_args(known))}")
+    guess = options.guess
     if guess is not None and guess != "solution" and not (guess.isdecimal() and int(guess) > 0):
         raise InputError(f"--guess {guess}: must be 'solution' or the number of a guess, from 1")
-    rule = Tolerance(tolerance, kind, complementarity)
-    return SolveOptions(rule, max_iterations, guess, out, force)
+    return replace(options, tolerance=Tolerance(tolerance, kind, complementarity))
 
 
 @dataclass(frozen=True)
@@ -106,27 +135,29 @@ def solve_file(
     """
     if options.out is not None:
         refuse_existing(parallel, options.out, options.force)
-    compile_kernels(parallel)
+    compile_kernels(parallel, options.choice)
     started = perf_counter()
     problem = read_problem(parallel, path, options.guess)
+    if options.form == "velocity" and problem.form == "local":
+        raise InputError("--form velocity: a local problem has no M and H, it needs contact")
     operator = _operator(problem, parallel)
     cone = cone_problem(operator, operator.offset, problem.mu, parallel)
     prepared = perf_counter() - started
+    solver = make_solver(options.choice)
     try:
         for line in _problem_lines(problem, operator.description, cone, options):
             say(line)
-        report = Apgd(
-            ApgdOptions(tolerance=options.tolerance, max_iterations=options.max_iterations)
-        ).solve(cone, _guess(problem, options.guess))
-        for line in _report_lines(report, cone, prepared):
+        report = solver.solve(cone, _guess(problem, options.guess))
+        for line in _report_lines(report, cone, options.law, prepared):
             say(line)
         if not operator.symmetric:
             say(_asymmetry_line(problem.form, operator.asymmetry))
-        for line in _stored_lines(problem, cone, report):
+        for line in _stored_lines(problem, cone, options.law, report):
             say(line)
         if options.out is not None:
-            say(_write(parallel, options.out, problem, operator, report))
+            say(_write(parallel, options.out, problem, operator, options.law, report))
     finally:
+        solver.destroy()
         operator.destroy()
     return 0 if report.converged else NOT_CONVERGED
 
@@ -181,6 +212,7 @@ def _write(
     out: Path,
     problem: FclibProblem,
     operator: MatrixDelassus | FactoredDelassus,
+    law: Law,
     report: SolveReport,
 ) -> str:
     """Collective. Write the result; returns a line that says so."""
@@ -189,9 +221,11 @@ def _write(
         vectors["v"] = operator.body_velocity(report.impulse)
     attributes = {
         "program": f"dem-mpi {__version__}",
-        "model": "convex cone complementarity problem",
+        "model": LAWS[law],
+        "solver": report.solver,
         "converged": int(report.converged),
         "iterations": report.iterations,
+        "cone_problems": report.outer,
         "dual_residual": report.residuals.dual,
         "complementarity_residual": report.residuals.complementarity,
         "objective": report.residuals.objective,
@@ -218,30 +252,56 @@ def _problem_lines(
         value = rule.value * (cone.velocity_scale if rule.kind == "scaled" else 1.0)
         work = rule.relative_work * cone.velocity_scale * cone.impulse_scale
         limits = f"dual <= {value:.3e} m/s ({rule.kind}), complementarity <= {work:.3e} J"
+    most = {
+        "apgd": f"{options.max_iterations} iterations",
+        "scip": f"{options.newton_iterations} Newton iterations",
+    }
+    if options.solver == "auto":
+        limit = f"{most['apgd']} of apgd and {most['scip']} of scip"
+    else:
+        limit = most[options.solver]
+    if options.law == "coulomb":
+        limit += " for each cone problem"
     return [
         f"{problem.path.name}{f' ({title})' if title else ''}: {problem.form} problem, "
         f"{problem.contacts.total} contacts, {problem.rows} rows, {matrices}, "
         f"{ranks} rank{'s' if ranks > 1 else ''}",
+        f"law: {LAWS[options.law]}; solver: {options.solver}",
         f"scales: v_ref = {cone.velocity_scale:.3e} m/s, gamma_ref = {cone.impulse_scale:.3e} N s",
-        f"start: {start}; stop: {limits}, or {options.max_iterations} iterations",
+        f"start: {start}; stop: {limits}, or {limit}",
     ]
 
 
-def _report_lines(report: SolveReport, cone: ConeProblem, prepared: float) -> list[str]:
-    r, thesis = report.residuals, thesis_residuals(report, cone)
+def _report_lines(report: SolveReport, cone: ConeProblem, law: Law, prepared: float) -> list[str]:
+    """Collective. What the solve did, and the residuals of the law it was made for."""
+    r = report.residuals
     v, gamma = cone.velocity_scale, cone.impulse_scale
     outcome = "converged" if report.converged else f"NOT CONVERGED: {report.reason}"
-    return [
-        f"{outcome}: {report.iterations} iterations, {report.products} products with W, "
+    kind = "Newton iterations" if report.solver == "scip" else "iterations"
+    rounds = f" in {report.outer} cone problems" if law == "coulomb" else ""
+    lines = [
+        f"{outcome}: {report.iterations} {kind}{rounds}, {report.products} products with W, "
         f"{report.seconds['solve']:.3g} s (reading and set-up {prepared:.3g} s)",
         f"  primal           {r.primal:.3e} N s  (/ gamma_ref        {r.primal / gamma:.3e})",
         f"  dual             {r.dual:.3e} m/s  (/ v_ref            {r.dual / v:.3e})",
         f"  complementarity  {r.complementarity:.3e} J    "
         f"(/ v_ref gamma_ref  {r.complementarity / (v * gamma):.3e})",
-        f"  thesis           primal {thesis.primal:.3e}, dual {thesis.dual:.3e}, "
-        f"complementarity {thesis.complementarity:.3e} (S. De 2.35-2.37)",
-        f"  objective        {r.objective:.12e} J",
     ]
+    if law == "ccp":
+        thesis = thesis_residuals(report, cone)
+        lines.append(
+            f"  thesis           primal {thesis.primal:.3e}, dual {thesis.dual:.3e}, "
+            f"complementarity {thesis.complementarity:.3e} (S. De 2.35-2.37)"
+        )
+    lines.append(f"  objective        {r.objective:.12e} J")
+    if report.factorisations:
+        entries = f" of {report.factor_entries} entries" if report.factor_entries else ""
+        lines.append(
+            f"  linear systems   {report.form} form, {report.factorisations} "
+            f"factorisations{entries}, residual <= {report.linear_residual:.1e} after "
+            f"{report.refinements} refinements"
+        )
+    return lines
 
 
 def _asymmetry_line(form: str, asymmetry: float) -> str:
@@ -253,29 +313,42 @@ def _asymmetry_line(form: str, asymmetry: float) -> str:
     )
 
 
-def _stored_lines(problem: FclibProblem, cone: ConeProblem, report: SolveReport) -> list[str]:
-    """Collective. How the impulses in the file compare with ours."""
+def _stored_lines(
+    problem: FclibProblem, cone: ConeProblem, law: Law, report: SolveReport
+) -> list[str]:
+    """Collective. How the impulses in the file compare with ours, under the law that we solved."""
     lines = [f"stored {_name(name)}: r is zero, so there is none" for name in problem.empty]
     for name, impulse in problem.stored.items():
-        r = _residuals_of(cone, impulse)
-        difference = np.abs(impulse - report.impulse).max(initial=0.0)
-        largest = np.array([difference, np.abs(impulse).max(initial=0.0)])
+        velocity, r = _judged(cone, law, impulse)
+        largest = np.array(
+            [
+                np.abs(impulse - report.impulse).max(initial=0.0),
+                np.abs(impulse).max(initial=0.0),
+                np.abs(velocity - report.velocity).max(initial=0.0),
+            ]
+        )
         cone.parallel.max_in_place(largest)
+        lower = r.objective - report.residuals.objective
+        # Only the relaxation makes the objective as small as it can be.
+        compared = f", ours is lower by {lower:.3e}" if law == "ccp" else ""
         lines += [
             f"stored {_name(name)}: primal {r.primal:.3e} N s, dual {r.dual:.3e} m/s, "
             f"complementarity {r.complementarity:.3e} J",
-            f"  objective        {r.objective:.12e} J, ours is lower by "
-            f"{r.objective - report.residuals.objective:.3e}",
+            f"  objective        {r.objective:.12e} J{compared}",
             f"  impulses         differ by at most {largest[0]:.3e} N s of {largest[1]:.3e} N s",
+            f"  velocities       differ by at most {largest[2]:.3e} m/s",
         ]
     return lines
 
 
-def _residuals_of(cone: ConeProblem, impulse: NDArray) -> Residuals:
+def _judged(cone: ConeProblem, law: Law, impulse: NDArray) -> tuple[NDArray, Residuals]:
+    """Collective. g = N impulse + b of an impulse that somebody else made, and its residuals."""
+    impulse = np.ascontiguousarray(impulse)
     velocity = np.empty_like(impulse)
     cone.operator.apply(impulse, velocity)
     velocity += cone.b
-    return evaluate(cone, np.ascontiguousarray(impulse), velocity)
+    judge = law_residuals if law == "coulomb" else evaluate
+    return velocity, judge(cone, impulse, velocity)
 
 
 def _name(stored: str) -> str:
@@ -285,29 +358,40 @@ def _name(stored: str) -> str:
 # ---- compilation ---------------------------------------------------------------------------
 
 
-class _Unit:
-    """W = 1 for one contact."""
-
-    def apply(self, impulse: NDArray, out: NDArray) -> None:
-        out[:] = impulse
-
-    def diagonal(self) -> NDArray:
-        return np.ones((1, COLUMNS))
-
-
-def compile_kernels(parallel: Parallel) -> None:
+def compile_kernels(parallel: Parallel, options: SolverOptions) -> None:
     """Collective. Compile the solver's kernels on rank 0, then load them on the others.
 
     Ranks that compiled at the same time would race for numba's cache on disk.
     """
+    # PETSc starts on all ranks together.
+    import petsc4py.PETSc  # noqa: F401
+
     error = None
     for turn in (True, False):
         if (parallel.rank == 0) == turn:
             try:
                 alone = Parallel.alone()
-                falling = cone_problem(_Unit(), np.array([[-1.0, 1.0, 0.0]]), np.ones(1), alone)
-                Apgd().solve(falling, np.zeros((1, COLUMNS)))
+                _solve_one_contact(alone, options)
                 alone.free()
             except Exception as caught:
                 error = caught
         parallel.raise_together(error)
+
+
+def _solve_one_contact(alone: Parallel, options: SolverOptions) -> None:
+    """Solve for a point of 1 kg that comes down sliding, W = 1."""
+    problem = FclibProblem(
+        path=Path("one contact"),
+        form="local",
+        dimension=COLUMNS,
+        contacts=Share.of(1, alone),
+        mu=np.ones(1),
+        offset=np.array([[-1.0, 1.0, 0.0]]),
+        delassus=sparse.identity(COLUMNS, format="csr"),
+    )
+    operator = _operator(problem, alone)
+    section = options.scip.model_copy(update={"form": "auto"})  # W alone has no velocity form
+    solver = make_solver(replace(options, scip=section))
+    solver.solve(cone_problem(operator, operator.offset, problem.mu, alone), np.zeros((1, COLUMNS)))
+    solver.destroy()
+    operator.destroy()
