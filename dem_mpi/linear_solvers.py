@@ -105,7 +105,7 @@ class Direct:
         pc.setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
         pc.setFactorSetUpSolverType()
         factor = pc.getFactorMatrix()
-        factor.setMumpsIcntl(7, _ORDERINGS[self._options.ordering])
+        factor.setOptionsPrefix(PREFIX)
         factor.setMumpsIcntl(28, 1)
         factor.setMumpsIcntl(14, self._workspace)
         if self._block > 1 and self._symmetric:
@@ -114,6 +114,15 @@ class Direct:
             factor.setMumpsIcntl(23, max(1, int(self._options.memory)))
         self._ksp.setFromOptions()
         self.analyses += 1
+        # PETSC_OPTIONS of the user go first. PETSc sets this one anew when it starts MUMPS, by the
+        # first set-up, so that it can only be given as an option, and is taken back after that.
+        options, key = PETSc.Options(), f"{PREFIX}mat_mumps_icntl_7"
+        given = options.hasName(key)
+        if not given:
+            options[key] = _ORDERINGS[self._options.ordering]
+        self._ksp.setUp()
+        if not given:
+            options.delValue(key)
 
     def set_up(self) -> None:
         """Collective. Factorise; a first time, analyse too. Once more if the space ran out."""
@@ -135,9 +144,10 @@ class Direct:
     def _factorise(self) -> int:
         if self._ksp is None:
             self._create()
-        # Tells PETSc that the values are new; it sees itself that the pattern is not.
-        self._ksp.setOperators(self._matrix)
-        self._ksp.setUp()
+        else:
+            # Tells PETSc that the values are new; it sees itself that the pattern is not.
+            self._ksp.setOperators(self._matrix)
+            self._ksp.setUp()
         return self._ksp.getPC().getFactorMatrix().getMumpsInfog(1)
 
     def _sentence(self, error: int) -> str:
