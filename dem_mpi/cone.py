@@ -36,6 +36,8 @@ class ConeProblem:
     """One problem, distributed: each rank has the rows of the contacts it owns.
 
     b : (m, columns) [m/s]; mu : (m,); velocity_scale [m/s] is v_ref of the scaled residuals.
+    elongation : longest side over the mean side of the region of the bodies, for those who have to
+    guess how a factorisation of N would fill in
     """
 
     operator: Delassus
@@ -45,6 +47,7 @@ class ConeProblem:
     impulse_scale: float
     parallel: Parallel
     threads: int = 1
+    elongation: float = 1.0
 
     @property
     def contacts(self) -> int:

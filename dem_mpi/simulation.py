@@ -40,6 +40,7 @@ from dem_mpi.scenario import Scenario, friction_table, frictional
 from dem_mpi.scene_models import only_spheres
 from dem_mpi.solvers.choice import SolverOptions, make_solver
 from dem_mpi.solvers.result import SolveReport
+from dem_mpi.solvers.work import elongation_of
 from dem_mpi.state import State
 from dem_mpi.walls import Walls, wall_faces, walls_at
 
@@ -513,9 +514,17 @@ class Simulation:
             v_ref = self.parallel.max(float(np.max(-b_gap, initial=0.0)))
         gamma_ref = v_ref / median_of_positive(operator.diagonal(), self.parallel)
         problem = ConeProblem(
-            operator, b, contacts.friction, v_ref, gamma_ref, self.parallel, self.scenario.threads
-        )
+            operator, b, contacts.friction, v_ref, gamma_ref, self.parallel,
+            self.scenario.threads, self._elongation(),
+        )  # fmt: skip
         return problem, b_gap, b_wall, float(largest[1])
+
+    def _elongation(self) -> float:
+        """Collective. Of the region that the bodies fill; 1 where no solver asks for it."""
+        if self.scenario.contact.solver != "auto":
+            return 1.0
+        bodies = self.state.bodies
+        return elongation_of(self.wrapped_position(), bodies.smallest_size, self.parallel)
 
     def _smaller_size(self, contacts: ContactSet) -> NDArray:
         """Return the radius (m,) [m] of the largest sphere inside the smaller body."""

@@ -10,6 +10,7 @@ L the step constant; theta the momentum sequence; S the scaling gamma = S z.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 
@@ -54,10 +55,13 @@ class Apgd:
         guess: NDArray,
         lipschitz: float | None = None,
         tolerance: Tolerance | None = None,
+        keep_going: Callable[[int, int, float], bool] | None = None,
     ) -> SolveReport:
         """Collective. Iterate from `guess` (m, columns) [N s] until the tolerance holds.
 
-        `tolerance` takes the place of the one in the options for this problem.
+        `tolerance` takes the place of the one in the options for this problem. `keep_going` is
+        asked after every iteration, with the iterations and products so far and the merit, which
+        are the same on all ranks; where it says no, on all ranks alike, the solve ends.
 
         Returns the best iterate seen, with the reason in words when it did not converge. Rows of
         the guess that are not finite start from zero. The guess is taken over, not copied: memory
@@ -145,6 +149,9 @@ class Apgd:
             if merit < 0.9 * best_merit or merit <= 1.0:
                 best[:] = gamma
                 best_merit = merit
+            if keep_going is not None and not keep_going(iteration, products, merit):
+                reason = "ended by who called for the solve"
+                break
 
         if (best_merit < merit and not fixed) or not math.isfinite(merit):
             gamma = best
