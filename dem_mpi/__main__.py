@@ -113,6 +113,7 @@ def run_command(
         kinds,
         (contact.solver,),
         contact.law,
+        contact.scip.form,
     )
     seconds = perf_counter() - started
     if seconds > 2.0:
@@ -292,7 +293,9 @@ def warmup(
 
     set_threads(threads)
     started = perf_counter()
-    warm_up(Parallel(), threads, ("matrix_free", "assembled"), (SPHERES, GENERAL))
+    parallel, kinds = Parallel(), (SPHERES, GENERAL)
+    warm_up(parallel, threads, ("matrix_free", "assembled"), kinds, ("apgd", "scip"))
+    warm_up(parallel, threads, kinds=kinds, law="coulomb")
     _print(f"kernels ready in {perf_counter() - started:.1f} s")
 
 

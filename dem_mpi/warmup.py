@@ -38,8 +38,11 @@ walls:
 time: {{step: 1e-3, end: 2e-3}}
 threads: {threads}
 contact: {{operator: {operator}, solver: {solver}, law: {law}, max_iterations: 3,
-  stop_factor: 1e9}}
+  tolerance: 1e-9, complementarity: 1e-9, stop_factor: 1e9, scip: {{form: {form}}}}}
 """
+# What solver: auto may call, and form: auto.
+_SOLVERS = {"apgd": ("apgd",), "scip": ("scip",), "auto": ("apgd", "scip")}
+_FORMS = {"velocity": ("velocity",), "contact": ("contact",), "auto": ("velocity", "contact")}
 
 
 def set_threads(threads: int) -> None:
@@ -60,21 +63,28 @@ def warm_up(
     kinds: tuple[str, ...] = (SPHERES,),
     solvers: tuple[str, ...] = ("apgd",),
     law: str = "ccp",
+    form: str = "auto",
 ) -> None:
     """Collective. Compile what these operators and kinds of scene use on rank 0, then load it.
 
     kinds : SPHERES, GENERAL or both; a scene with any body that is not a sphere is GENERAL.
-    solvers, law : as in the contact section of a scene
+    solvers, law, form : as in the contact section of a scene; nothing else is compiled, and PETSc
+    is not even imported where neither operators nor solvers need it.
     """
-    if "assembled" in operators or {"scip", "auto"} & set(solvers):
+    called = [
+        (solver, shape)
+        for solver in sorted({each for asked in solvers for each in _SOLVERS[asked]})
+        for shape in (_FORMS[form] if solver == "scip" else ("auto",))
+    ]
+    if "assembled" in operators or any(solver == "scip" for solver, _ in called):
         # PETSc starts on all ranks together: one that came alone would wait for the others.
         import petsc4py.PETSc  # noqa: F401
     error = None
     for turn in (True, False):
         if (parallel.rank == 0) == turn:
             try:
-                for operator, kind, solver in product(operators, kinds, solvers):
-                    _exercise(threads, operator, kind, solver, law)
+                for operator, kind, (solver, shape) in product(operators, kinds, called):
+                    _exercise(threads, operator, kind, solver, law, shape)
             except Exception as caught:
                 error = caught
         parallel.raise_together(error)
@@ -85,7 +95,7 @@ def kind_of(scenario: Scenario) -> str:
     return SPHERES if only_spheres(scenario) else GENERAL
 
 
-def _exercise(threads: int, operator: str, kind: str, solver: str, law: str) -> None:
+def _exercise(threads: int, operator: str, kind: str, solver: str, law: str, form: str) -> None:
     """Run two steps of a scene of four bodies on this rank alone."""
     alone = Parallel.alone()
     text = _SCENE.format(
@@ -95,6 +105,7 @@ def _exercise(threads: int, operator: str, kind: str, solver: str, law: str) -> 
         aspect_ratio=_ASPECT_RATIO[kind],
         solver=solver,
         law=law,
+        form=form,
     )
     scenario = parse_scenario(text, "warm-up").scenario
     place(alone, scenario)  # random places have kernels of their own
