@@ -13,7 +13,8 @@ had 2.73, 2.74 and 2.75 contacts a body, for which this gives 2.80; mu = 0 had 3
 Memory. A base for interpreter, libraries and compiled kernels; so many bytes for each body,
 measured on 125,000 that touch nothing; so many for each contact, counted from the arrays that are
 alive in a solve. Fitted on one rank to cubic packings of 125,000 spheres with and without friction,
-matrix-free and assembled.
+matrix-free and assembled. The interior point method adds its vectors, its matrix and above all the
+factor of that, whose entries `solvers.work` foretells within a factor 2 from the shape of the bed.
 """
 
 from __future__ import annotations
@@ -22,12 +23,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dem_mpi.bodies import FIELDS
+from dem_mpi.errors import InputError
 from dem_mpi.scenario import Scenario, body_count, friction_table, frictional
 from dem_mpi.scene_models import only_spheres
 from dem_mpi.scene_walls import BoxWall
 from dem_mpi.sizes import mean_radius, mean_volume
+from dem_mpi.solvers.work import Size, elongation, factor_memory
 from dem_mpi.wall_checks import holds
 from dem_mpi.walls import wall_faces
 
@@ -43,6 +47,12 @@ _GHOST = 600  # the same rows, and buffers to send and receive them
 _CONTACT = 72 + 28 + 32 + 8
 # b, d, the best impulse, and three each of impulse and velocity; the scaling comes on top
 _CONTACT_VECTORS = 9
+# Of the interior point method: iterate, scalings and two directions, for c components of an impulse
+# 18 c + 2 c^2 + 1 numbers; of its matrix two blocks, with what MUMPS's analysis makes of them.
+_NEWTON_VECTORS = (21, 73)
+_NEWTON_ENTRY = 2 * (8 + 4) + 12
+_MUMPS = 40 << 20  # its code and that of the orderings
+_DOUBT = 1.5  # estimates this much over a limit are refused
 _MATRIX_ENTRY = 2 * (8 + 4)  # value and column, in PETSc and where the rows are filled
 _MATRIX_ROW = 2 * 4 + 2 * 8  # row pointers likewise, and its place in two vectors
 
@@ -61,6 +71,7 @@ class Estimate:
     """What a run of a scene would take; sizes in B, memory for the fullest of `ranks` ranks.
 
     settled : whether the contacts are those of a settled packing, rather than of free bodies
+    factors : the part of the memory that factors of Newton matrices take, 0 where there are none
     """
 
     bodies: int
@@ -74,6 +85,7 @@ class Estimate:
     checkpoints: int
     ranks: int
     memory: int
+    factors: int
     warnings: tuple[str, ...]
 
     def lines(self) -> list[str]:
@@ -90,6 +102,7 @@ class Estimate:
             f"trajectory   {_size(self.trajectory)} in {self.frames:,} frames, uncompressed",
             f"checkpoints  {kept} kept, one more while it is written",
             f"memory       about {_size(self.memory)} a rank on {several} (estimate)",
+            *([f"factors      about {_size(self.factors)} of it"] if self.factors else []),
             *(f"warning: {warning}" for warning in self.warnings),
         ]
 
@@ -112,6 +125,7 @@ def estimate(scenario: Scenario, ranks: int = 1) -> Estimate:
         checkpoints=min(scenario.checkpoint.keep, -(-scenario.steps // scenario.checkpoint_every)),
         ranks=ranks,
         memory=rank_memory(scenario, bodies, contacts, ranks),
+        factors=factor_share(scenario, bodies, contacts, ranks),
         warnings=_warnings(bodies, ranks),
     )
 
@@ -141,6 +155,12 @@ def contacts_per_body(scenario: Scenario) -> float:
 
 def _layers(scenario: Scenario) -> float | None:
     """Depth of the settled bed in diameters; None where no box says how large the floor is."""
+    sides = _sides(scenario)
+    return None if sides is None else float(sides[0])
+
+
+def _sides(scenario: Scenario) -> NDArray | None:
+    """Depth of the settled bed and the sides of its floor, (3,), in mean diameters."""
     boxes = [wall for wall in scenario.walls if isinstance(wall, BoxWall)]
     down = np.abs(np.array(scenario.gravity))
     if not boxes or not down.any():
@@ -155,7 +175,7 @@ def _layers(scenario: Scenario) -> float | None:
         volume += count * mean_volume(group)
         diameters += count * 2.0 * mean_radius(group)
     depth = volume / _PACKING_FRACTION / float(extent.prod())
-    return depth * body_count(scenario) / diameters
+    return np.append(depth, extent) * body_count(scenario) / diameters
 
 
 # ---- files ---------------------------------------------------------------------------------
@@ -204,9 +224,62 @@ def rank_memory(scenario: Scenario, bodies: int, contacts: int, ranks: int) -> i
         base += _PETSC
         # D^T has for each of two bodies 3 entries in the normal row and 6 in either tangent's.
         contact += _MATRIX_ENTRY * (30 if columns == 3 else 6) + _MATRIX_ROW * columns
+    newton = scenario.contact.solver != "apgd"
+    body = _BODY
+    if newton:
+        rows = _freedoms(scenario)
+        base += _PETSC + _MUMPS + factor_share(scenario, bodies, contacts, ranks)
+        contact += 8 * _NEWTON_VECTORS[columns == 3] + 2 * rows**2 * _NEWTON_ENTRY
+        body += rows**2 * _NEWTON_ENTRY
     # Ghosts are one layer of neighbours around a cube of bodies.
     ghosts = min(round(6.0 * own_bodies ** (2.0 / 3.0)), bodies - own_bodies)
-    return base + own_bodies * _BODY + own_contacts * contact + ghosts * _GHOST
+    return base + own_bodies * body + own_contacts * contact + ghosts * _GHOST
+
+
+def factor_share(scenario: Scenario, bodies: int, contacts: int, ranks: int) -> int:
+    """Memory [B] of a rank for the factorisation of a Newton matrix; 0 where none is made."""
+    contact = scenario.contact
+    if contact.solver == "apgd" or contact.scip.linear != "mumps":
+        return 0
+    sides = _sides(scenario)
+    columns = 3 if frictional(scenario) else 1
+    size = Size(
+        contacts=contacts,
+        bodies=bodies,
+        largest=-(-contacts // ranks),
+        columns=columns,
+        rows=2 * columns if contact.scip.form == "contact" else _freedoms(scenario),
+        elongation=1.0 if sides is None else elongation(np.maximum(sides, 1.0)),
+        ranks=ranks,
+    )
+    return round(factor_memory(size) * (1.0 + contact.scip.workspace / 100.0))
+
+
+def refuse_what_does_not_fit(scenario: Scenario, ranks: int, share: int) -> None:
+    """Raise InputError where factors would need far more than they may, or a rank than `share` [B].
+
+    With `solver: auto` they are made only where they fit.
+    """
+    if scenario.contact.solver != "scip":
+        return
+    found = estimate(scenario, ranks)
+    allowed = scenario.contact.scip.memory
+    remedy = "use more ranks, contact.scip.linear: cg, or contact.solver: auto"
+    if allowed is not None and found.factors > _DOUBT * allowed * 1e6:
+        raise InputError(
+            f"contact.scip.memory = {allowed:g} MB: factors of Newton matrices would take about "
+            f"{found.factors / 1e6:.0f} MB a rank; raise it, {remedy}"
+        )
+    if found.memory > _DOUBT * share:
+        raise InputError(
+            f"contact.solver = scip would take about {_size(found.memory)} a rank, "
+            f"{_size(found.factors)} of it for factors of Newton matrices, and this machine has "
+            f"{_size(share)}: {remedy}"
+        )
+
+
+def _freedoms(scenario: Scenario) -> int:
+    return 6 if frictional(scenario) or not only_spheres(scenario) else 3
 
 
 def _warnings(bodies: int, ranks: int) -> tuple[str, ...]:

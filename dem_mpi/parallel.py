@@ -59,6 +59,14 @@ class Parallel:
         """Return a group of this rank only."""
         return cls(MPI.COMM_SELF)
 
+    def ranks_of_machine(self) -> int:
+        """Collective. The number of these ranks that share this rank's memory."""
+        here = self.communicator.Split_type(MPI.COMM_TYPE_SHARED)
+        try:
+            return here.Get_size()
+        finally:
+            here.Free()
+
     # ---- reductions ------------------------------------------------------------------------
     # Integers and flags of any width are reduced in 64 bits, so that counts cannot overflow.
 

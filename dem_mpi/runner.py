@@ -14,9 +14,10 @@ import numpy as np
 from dem_mpi import __version__, checkpoint
 from dem_mpi.bodies import FIELDS, Bodies
 from dem_mpi.errors import DemError, InputError, StoppedError
-from dem_mpi.estimate import checkpoint_bytes
+from dem_mpi.estimate import checkpoint_bytes, refuse_what_does_not_fit
 from dem_mpi.h5files import OutputLock, require_space
 from dem_mpi.insertion import changed_count
+from dem_mpi.machine import memory_share
 from dem_mpi.metrics import PHASES, MetricsLog, Progress, closing_table, resident_memory
 from dem_mpi.output import Field, Series, Trajectory, describe, frame_bytes
 from dem_mpi.parallel import Parallel
@@ -105,6 +106,8 @@ class Run:
 
     def open(self) -> None:
         """Collective. Place the bodies or read the checkpoint, and open the output."""
+        parallel = self._parallel
+        refuse_what_does_not_fit(self._scenario, parallel.size, memory_share(parallel))
         state, resumed = self._initial_state()
         self._check_space(self._scenario.steps - state.step)
         self._trajectory = self._open_trajectory(state, resumed)

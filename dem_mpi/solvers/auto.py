@@ -23,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dem_mpi.cone import ConeProblem, Tolerance
+from dem_mpi.machine import memory_share
+from dem_mpi.parallel import Parallel
 from dem_mpi.solvers import work
 from dem_mpi.solvers.apgd import Apgd
 from dem_mpi.solvers.result import Solver, SolveReport
@@ -31,6 +33,8 @@ _WINDOW = 0.8  # part of the iterations so far whose fall is extended
 _SAMPLES = 33
 _FIRST_LOOK = 20  # iterations
 _NEXT_LOOK = 1.1
+_SMALL = 5e8  # B
+_PART_OF_MACHINE = 0.7  # that factors may take
 
 
 @dataclass(frozen=True)
@@ -141,12 +145,14 @@ class Auto:
         """Collective. The interior point method's price in products, and why it may not be used."""
         newton = self.scip.options.newton
         size = work.size_of(problem, newton.form)
-        needed = work.factor_memory(size) * (1.0 + newton.workspace / 100.0) / 1e6
-        if newton.linear == "mumps" and newton.memory is not None and needed > newton.memory:
-            return math.inf, (
-                f"factors of Newton matrices would take about {needed:.0f} MB a rank, and "
-                f"contact.scip.memory allows {newton.memory:g} MB"
-            )
+        needed = work.factor_memory(size) * (1.0 + newton.workspace / 100.0)
+        if newton.linear == "mumps":
+            allowed, by = _allowed_memory(needed, newton.memory, problem.parallel)
+            if needed > allowed:
+                return math.inf, (
+                    f"factors of Newton matrices would take about {needed / 1e6:.0f} MB a rank, "
+                    f"and {by} allows {allowed / 1e6:.0f} MB"
+                )
         limit = tolerance.value * (1.0 if tolerance.kind == "absolute" else problem.velocity_scale)
         decades = math.log10(max(1.0, problem.velocity_scale / limit)) if limit > 0.0 else 16.0
         return work.interior_point_work(size, decades) / work.product_work(size), ""
@@ -160,6 +166,15 @@ class Auto:
         return self.apgd.solve(
             problem, begin.impulse.copy(), parts[0].lipschitz, tolerance, lambda k, *_: k < left
         )
+
+
+def _allowed_memory(needed: float, limit: float | None, parallel: Parallel) -> tuple[float, str]:
+    """Collective. What a rank may use for factors [B], and who says so; limit [MB]."""
+    if limit is not None:
+        return 1e6 * limit, "contact.scip.memory"
+    if needed < _SMALL:  # no need to ask, in every step, what any machine has
+        return math.inf, ""
+    return _PART_OF_MACHINE * memory_share(parallel), "the machine"
 
 
 def joined(problem: ConeProblem, tolerance: Tolerance, parts: list[SolveReport]) -> SolveReport:

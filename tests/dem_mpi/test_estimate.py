@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from dem_mpi.estimate import Estimate, checkpoint_bytes, estimate
+from dem_mpi.errors import InputError
+from dem_mpi.estimate import Estimate, checkpoint_bytes, estimate, refuse_what_does_not_fit
 from dem_mpi.scenario import parse_scenario
 
 from launch import ROOT, run_ranks
@@ -79,6 +80,56 @@ def test_memory_of_a_rank_is_foretold_within_30_percent(tmp_path, mu, ranks):
     assert foretold.memory == pytest.approx(peak, rel=0.30)
     # The program itself is most of it; the part that grows with the scene must be right as well.
     assert foretold.memory - alone.memory == pytest.approx(peak - alone.memory, rel=0.35)
+
+
+SCIP = "solver: scip, tolerance: 1.0e-9, complementarity: 1.0e-9, scip: {max_iterations: 1}"
+
+
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_memory_with_factors_of_newton_matrices_is_foretold(tmp_path, ranks):
+    """A cube of 4,096 bodies, whose factor takes as much again as the program.
+
+    Entries of a factor are foretold within a factor 1.5, memory of the whole within a third.
+    """
+    side = 16 * 0.02005
+    text = DENSE.format(mu=0.3, count=16**3, side=side).replace(
+        "tolerance: 1, complementarity: 1", SCIP
+    )
+    foretold = estimate_of(text, ranks)
+    assert foretold.factors > 1e8 / ranks
+    printed = run_scene(text, tmp_path, ranks)
+    peak = int(re.search(r"peak memory per rank (\d+) MiB", printed)[1]) * 2**20
+    assert foretold.memory == pytest.approx(peak, rel=0.33)
+
+
+def test_only_solvers_with_factors_take_memory_for_them():
+    text = DENSE.format(mu=0.3, count=16**3, side=16 * 0.02005)
+    scip = text.replace("tolerance: 1, complementarity: 1", SCIP)
+    frictionless = scip.replace("default: 0.3", "default: 0")
+    assert estimate_of(text).factors == 0
+    assert estimate_of(scip.replace("max_iterations: 1}", "linear: cg}")).factors == 0
+    # Three unknowns a body for six, squared, and a fifth more contacts.
+    ratio = estimate_of(frictionless).factors / estimate_of(scip).factors
+    assert 0.25 < ratio < 0.35
+    assert "factors" in "\n".join(estimate_of(scip).lines())
+
+
+def test_factors_that_cannot_fit_are_refused_before_anything_is_done():
+    text = DENSE.format(mu=0.3, count=100 * 100 * 40, side=100 * 0.02005)
+    scip = text.replace("tolerance: 1, complementarity: 1", SCIP)
+    limited = scip.replace("max_iterations: 1}", "memory: 500}")
+    half_terabyte = 2**39
+
+    def refuse(text: str, share: int) -> None:
+        refuse_what_does_not_fit(parse_scenario(text, "scene.yaml").scenario, 1, share)
+
+    with pytest.raises(InputError, match=r"contact\.solver = scip would take .*this machine has"):
+        refuse(scip, 2**35)
+    with pytest.raises(InputError, match=r"contact\.scip\.memory = 500 MB: .* raise it"):
+        refuse(limited, half_terabyte)
+    refuse(scip, half_terabyte)
+    refuse(scip.replace("solver: scip", "solver: auto"), 2**35)
+    refuse(text, 2**35)
 
 
 def test_contacts_and_files_of_a_settled_bed_are_foretold(tmp_path):
