@@ -14,6 +14,7 @@ from dem_mpi.parallel import Parallel
 
 PREFIX = "scip_"
 Ordering = Literal["auto", "amd", "metis", "scotch", "pord"]
+Preconditioner = Literal["block_jacobi", "icc"]
 
 # MUMPS numbers its orderings (its users' guide, ICNTL(7)).
 _ORDERINGS = {"amd": 0, "scotch": 3, "pord": 4, "metis": 5, "auto": 7}
@@ -23,6 +24,8 @@ _TOO_LITTLE_SPACE = (-8, -9, -14, -15, -17, -20)
 _NO_MEMORY = (-5, -7, -13, -19)
 _RETRY_FACTOR = 4  # times as much extra space, once
 _MEGABYTE = 1e6
+_ITERATIONS = 10_000  # of conjugate gradients, at most, for one right-hand side
+_SMALLEST_RELATIVE = 1e-16  # below it no residual falls
 # Memory of MUMPS's analysis on rank 0: row and column of each entry of one triangle, read from all
 # ranks, and about as much again for the graph that is ordered [B per entry of the matrix].
 _ANALYSIS_BYTES = 12.0
@@ -56,8 +59,11 @@ class LinearSolver(Protocol):
     def set_up(self) -> None:
         """Collective. Take the matrix's new values. NewtonFailureError on all ranks."""
 
-    def solve(self, b: Any, x: Any, tolerance: float) -> int:
-        """Collective. x = K^-1 b, PETSc vectors; return the iterations spent, 0 if direct."""
+    def solve(self, b: Any, x: Any, goal: float) -> int:
+        """Collective. x = K^-1 b, PETSc vectors; return the iterations spent, 0 if direct.
+
+        goal : |b - K x| at which an iteration may stop; a direct solver has no use for it
+        """
 
     def destroy(self) -> None:
         """Collective. Free the PETSc objects."""
@@ -182,7 +188,7 @@ class Direct:
             return f"{what}: this MUMPS was built without the ordering asked for {code}"
         return f"{what}: error {error} of MUMPS, see INFOG(1) in its users' guide {code}"
 
-    def solve(self, b: Any, x: Any, tolerance: float) -> int:
+    def solve(self, b: Any, x: Any, goal: float) -> int:
         """Collective. x = K^-1 b by two triangular solves."""
         self._ksp.solve(b, x)
         return 0
@@ -192,6 +198,68 @@ class Direct:
         if self._ksp is not None:
             self._ksp.destroy()
             self._ksp = None
+
+
+class Iterative:
+    """Conjugate gradients, of a matrix marked SPD, with a preconditioner of few operations.
+
+    The residual it stops at is the plain one, |b - K x|: give it a matrix whose rows have one unit.
+    """
+
+    entries, memory, retries = 0, 0.0, 0
+
+    def __init__(self, matrix: Any, preconditioner: Preconditioner, parallel: Parallel) -> None:
+        """Collective."""
+        from petsc4py import PETSc
+
+        self._matrix, self._reasons = matrix, PETSc.KSP.ConvergedReason
+        self._ksp = PETSc.KSP().create(parallel.communicator)
+        self._ksp.setOptionsPrefix(PREFIX)
+        self._ksp.setType(PETSc.KSP.Type.CG)
+        self._ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+        self._ksp.setOperators(matrix)
+        pc = self._ksp.getPC()
+        if preconditioner == "block_jacobi":
+            pc.setType(PETSc.PC.Type.PBJACOBI)
+        else:
+            _choose_incomplete_cholesky(pc, PETSc)
+        self._ksp.setFromOptions()
+
+    def set_up(self) -> None:
+        """Collective. Make the preconditioner for the matrix's present values."""
+        self._ksp.setOperators(self._matrix)
+        self._ksp.setUp()
+
+    def solve(self, b: Any, x: Any, goal: float) -> int:
+        """Collective. Iterate from zero; what is missing at the end, the caller's residual says."""
+        self._ksp.setTolerances(rtol=_SMALLEST_RELATIVE, atol=goal, max_it=_ITERATIONS)
+        self._ksp.solve(b, x)
+        reason = self._ksp.getConvergedReason()
+        if reason in (self._reasons.DIVERGED_NANORINF, self._reasons.DIVERGED_PCSETUP_FAILED):
+            raise NewtonFailureError(
+                "the conjugate gradients of a Newton system broke down: set contact.scip.linear: "
+                "mumps, or another contact.scip.preconditioner"
+            )
+        return self._ksp.getIterationNumber()
+
+    def destroy(self) -> None:
+        """Collective. Free the PETSc objects."""
+        self._ksp.destroy()
+
+
+def _choose_incomplete_cholesky(pc: Any, petsc: Any) -> None:
+    """Block Jacobi with a block a rank, of each an incomplete Cholesky factor without fill."""
+    pc.setType(petsc.PC.Type.BJACOBI)
+    options = petsc.Options()
+    given = {"sub_pc_type": "icc", "sub_pc_factor_shift_type": "positive_definite"}
+    given = {f"{PREFIX}{key}": value for key, value in given.items()}
+    missing = [key for key in given if not options.hasName(key)]
+    for key in missing:
+        options[key] = given[key]
+    pc.setFromOptions()
+    pc.setUp()
+    for key in missing:
+        options.delValue(key)
 
 
 def _count(infog: int) -> int:

@@ -151,6 +151,16 @@ class FactoredDelassus:
         H.destroy()
         return W
 
+    @property
+    def velocity_rows(self) -> int:
+        """Rows of M."""
+        return self._bodies.total
+
+    @property
+    def contact_rows(self) -> int:
+        """Rows of H^T; none may be called few where M^-1 is dense, and W with it."""
+        return self._H_t.getSize()[0] if self._mass.matrix is not None else 2**62
+
     def velocity_factors(self) -> tuple[PETSc.Mat, PETSc.Mat]:
         """Collective. H^T, which stays this object's, and M as a new matrix."""
         return self._H_t, _matrix(self._mass_rows, self._bodies.count, self._parallel)
