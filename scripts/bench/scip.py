@@ -267,7 +267,7 @@ def records_of(known: Known) -> list[Record]:
         }
         if found.get("failure"):
             params["failure"] = found["failure"]
-            records.append(Record("scip.failure", params, math.nan, "1", ranks=piece.ranks))
+            records.append(Record("scip.failure", params, 1, "1", ranks=piece.ranks))
         for row in found["rows"]:
             records += _row_records(piece, row, params)
     return records + headlines(known) + growth(known) + crossings(known)
@@ -382,7 +382,7 @@ def crossings(known: Known) -> list[Record]:
             for decade in LADDER:
                 ours = seconds_to(known, state, ("scip velocity",), ranks, decade)
                 theirs = seconds_to(known, state, ("apgd cold", "apgd warm"), ranks, decade)
-                if ours is None or theirs is None:
+                if not (ours and theirs):  # not known, or true of the zero impulse
                     continue
                 params = {"state": state, "tolerance": decade}
                 records.append(
@@ -409,7 +409,7 @@ def seconds_to(
             count = row.get("to", {}).get("both", {}).get(f"{tolerance:.0e}")
             if row["tolerance"] == tolerance and row["converged"]:
                 found.append((0, row["seconds"]))
-            elif count is not None:
+            elif count:
                 once = row["phases"].get("analysis", 0.0)
                 found.append((1, once + count * per_iteration(row)))
     if not found:
@@ -596,7 +596,8 @@ def draw(known: Known, path: Path) -> None:
         axis.set_xlabel("largest error of a body's velocity [m/s]")
         axis.invert_xaxis()
     axes[0].set_title(state or "")
-    axes[0].legend(fontsize=8)
+    if axes[0].lines:
+        axes[0].legend(fontsize=8)
     for ranks in (1, 2):
         points = []
         for state in _states(known, ("piles", "large")):

@@ -68,8 +68,9 @@ def _pile(spheres: int) -> Recipe:
 
 
 def _shear(spheres: int) -> Recipe:
+    end = 0.1 if spheres <= 2000 else 0.04
     return Recipe(
-        f"shear-{spheres}", spheres, 0.01, 1.4, None, 1e-3, 0.1, 1e-3, 0.01, 0.05,
+        f"shear-{spheres}", spheres, 0.01, 1.4, None, 1e-3, end, 1e-3, 0.01, end / 2,
         parent=f"pile-{spheres}",
     )  # fmt: skip
 

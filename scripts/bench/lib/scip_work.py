@@ -93,7 +93,7 @@ def _ours(
     task: dict[str, Any],
 ) -> dict[str, Any]:
     """Collective. Solve to one tolerance some times with solvers made anew; one row."""
-    parallel, seconds = problem.parallel, []
+    parallel, seconds, memory = problem.parallel, [], 0
     stop = criterion(problem, tolerance, task.get("kind", "both"))
     options = _options(task, stop)
     for _ in range(task.get("runs", 1)):
@@ -103,7 +103,7 @@ def _ours(
         began = perf_counter()
         report = solver.solve(problem, guess * (task.get("start", "cold") == "warm"))
         seconds.append(parallel.max(perf_counter() - began))
-        memory = parallel.sum(max(peak_memory() - before, 0))
+        memory = max(memory, parallel.sum(max(peak_memory() - before, 0)))
         solver.destroy()
     row = {
         "tolerance": tolerance,
