@@ -56,7 +56,7 @@ class CoulombOptions:
     """
 
     max_outer: int = 50
-    inner_factor: float = 0.03
+    inner_factor: float = 0.1
     finest: float = 0.5
     relaxation: float = 0.7
     memory: int = 5
