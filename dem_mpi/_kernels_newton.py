@@ -240,3 +240,22 @@ def block_product(A, x, out):
             x0, x1, x2 = x[i, 0], x[i, 1], x[i, 2]
             for t in range(3):
                 out[i, t] = A[i, t, 0] * x0 + A[i, t, 1] * x1 + A[i, t, 2] * x2
+
+
+@jit_threads
+def root_product(root, x, out):
+    """out_i = L_i (L_i^T x_i) for blocks L (m, c, c); may be done in place.
+
+    By L L^T, formed, rounding would add to every component the error of the largest.
+    """
+    c = x.shape[1]
+    for i in prange(x.shape[0]):
+        if c == 1:
+            out[i, 0] = root[i, 0, 0] * (root[i, 0, 0] * x[i, 0])
+        else:
+            x0, x1, x2 = x[i, 0], x[i, 1], x[i, 2]
+            y0 = root[i, 0, 0] * x0 + root[i, 1, 0] * x1 + root[i, 2, 0] * x2
+            y1 = root[i, 0, 1] * x0 + root[i, 1, 1] * x1 + root[i, 2, 1] * x2
+            y2 = root[i, 0, 2] * x0 + root[i, 1, 2] * x1 + root[i, 2, 2] * x2
+            for t in range(3):
+                out[i, t] = root[i, t, 0] * y0 + root[i, t, 1] * y1 + root[i, t, 2] * y2

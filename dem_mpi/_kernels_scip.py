@@ -1,4 +1,4 @@
-"""Compiled loops of the interior point method: algebra of the second-order cone, contact by contact.
+r"""Compiled loops of the interior point method: algebra of the second-order cone by contacts.
 
 Plain arrays in and out. With T = diag(1, 1/mu, 1/mu) of a contact, x = T gamma [N s] and
 y = T^-1 g [m/s] both belong to K = {x_n >= |x_t|}, and x.y = gamma.g. T differs from diag(mu, 1, 1)
@@ -7,10 +7,10 @@ T^-1 = diag(1, mu, mu) at mu = 0 leaves the half-line x_n >= 0 with x_t = y_t = 
 below, fed with zeros, is that of the half-line. The same holds for problems of one column.
 
 Symbols: x o y = (x.y, x_n y_t + y_n x_t) Jordan product; det x = x_n^2 - |x_t|^2; e = (1, 0, 0);
-J = diag(1, -1, -1). W = eta [w_n, w_t^T; w_t, 1 + w_t w_t^T/(1 + w_n)] with det w = 1 is the scaling
-of Nesterov and Todd, lambda = W x = W^-1 y the scaled point; P = W^2 = eta^2 (2 w w^T - J). A
-direction in the scaled space is (u, v) = (W dx, W^-1 dy) and fulfils u + v = c - lambda, where
-c = lambda \\ (what lambda o lambda + lambda o (u + v) shall be).
+J = diag(1, -1, -1). W = eta [w_n, w_t^T; w_t, 1 + w_t w_t^T/(1 + w_n)] with det w = 1 is the
+scaling of Nesterov and Todd, lambda = W x = W^-1 y the scaled point; P = W^2 = eta^2 (2 w w^T - J).
+A direction is (u, v) = (W dx, W^-1 dy) in the scaled space and fulfils u + v = c - lambda, where
+lambda o c is what x o y shall become, to first order; z = lambda \ a solves lambda o z = a.
 Sums run over chunks of fixed length, so the number of threads changes no bit.
 """
 
@@ -55,7 +55,7 @@ def _scaled(eta, wn, w1, w2, n, t1, t2):
 
 @jit
 def _quotient(ln, l1, l2, det, n, t1, t2):
-    """lambda \\ (n, t): the z with lambda o z = (n, t)."""
+    r"""lambda \ (n, t): the z with lambda o z = (n, t)."""
     along = l1 * t1 + l2 * t2
     zn = (ln * n - along) / det
     return zn, (t1 - zn * l1) / ln, (t2 - zn * l2) / ln
@@ -206,8 +206,11 @@ def scaling(x, y, mu, g, eta, w, lam, partial):
 
 
 @jit_threads
-def blocks(eta, w, mu, Q, R):
-    """R = T P T [m/s per N s] and Q = T^-1 P^-1 T^-1, (m, c, c); tangents of R are 0 at mu = 0."""
+def blocks(eta, w, mu, Q, R, root):
+    """R = T P T [m/s per N s], Q = T^-1 P^-1 T^-1 and its root T^-1 W^-1, all (m, c, c).
+
+    Q = root root^T. Tangents of R are 0 at mu = 0.
+    """
     rows = w.shape[1]
     for i in prange(w.shape[0]):
         wn, w1, w2 = _row(w, i)
@@ -215,16 +218,21 @@ def blocks(eta, w, mu, Q, R):
         f = mu[i]
         R[i, 0, 0] = scale * (2.0 * wn * wn - 1.0)
         Q[i, 0, 0] = (2.0 * wn * wn - 1.0) / scale
+        root[i, 0, 0] = wn / eta[i]
         if rows == 3:
             inverse = 1.0 / f if f > 0.0 else 0.0
             v = (w1, w2)
             for a in range(2):
                 R[i, 0, a + 1] = R[i, a + 1, 0] = scale * inverse * 2.0 * wn * v[a]
                 Q[i, 0, a + 1] = Q[i, a + 1, 0] = -f * 2.0 * wn * v[a] / scale
+                root[i, 0, a + 1] = -v[a] / eta[i]
+                root[i, a + 1, 0] = -f * v[a] / eta[i]
                 for b in range(2):
                     part = 2.0 * v[a] * v[b] + (1.0 if a == b else 0.0)
                     R[i, a + 1, b + 1] = scale * (inverse * inverse) * part
                     Q[i, a + 1, b + 1] = f * f * part / scale
+                    part = v[a] * v[b] / (1.0 + wn) + (1.0 if a == b else 0.0)
+                    root[i, a + 1, b + 1] = f * part / eta[i]
 
 
 @jit_threads
@@ -324,7 +332,7 @@ def gap_at(lam, u, v, step_x, step_y, partial):
 
 @jit_threads
 def second_order(lam, u, v, target, c):
-    """c = lambda \\ (target e - u o v): aims at the central path, with the predictor's error."""
+    r"""c = lambda \ (target e - u o v): aims at the central path, with the predictor's error."""
     for i in prange(lam.shape[0]):
         ln, l1, l2 = _row(lam, i)
         un, u1, u2 = _row(u, i)

@@ -128,8 +128,11 @@ class NewtonSystem:
         """
         return self._form.take(operator, mu)
 
-    def factor(self, Q: NDArray, R: NDArray) -> None:
+    def factor(self, Q: NDArray, R: NDArray, root: NDArray | None = None) -> None:
         """Collective. Factorise, or set up the preconditioner, for Q and R = Q^-1, (m, c, c).
+
+        root : (m, c, c) with Q = root root^T, found from Q if not given. Multiplied by its factors
+        Q keeps, for the small eigenvalues, the digits that its largest takes from its entries.
 
         NewtonFailureError on all ranks where that cannot be done.
         """
@@ -139,7 +142,7 @@ class NewtonSystem:
                 "the Newton matrix has entries that are not finite: the iterate has left the cones"
             )
         if self._contacts:
-            self._form.factor(Q, R)
+            self._form.factor(Q, R, _root(Q) if root is None else root)
 
     def solve(self, s: NDArray, out: NDArray, tolerance: float = TOLERANCE) -> LinearSolve:
         """Collective. out = (N + R)^-1 s, both (m, c), refined to the relative residual."""
@@ -207,7 +210,7 @@ class _Form(Protocol):
     def masked(self, s: NDArray) -> NDArray:
         """Return s with zeros in rows that have no unknown."""
 
-    def factor(self, Q: NDArray, R: NDArray) -> None:
+    def factor(self, Q: NDArray, R: NDArray, root: NDArray) -> None:
         """Collective."""
 
     def begin(self, s: NDArray) -> None:
@@ -261,8 +264,8 @@ class _VelocityForm:
     def masked(self, s: NDArray) -> NDArray:
         return _without_tangents(s, self._frictionless)
 
-    def factor(self, Q: NDArray, R: NDArray) -> None:
-        self._Q = Q
+    def factor(self, Q: NDArray, R: NDArray, root: NDArray) -> None:
+        self._root_of_Q = root
         self._matrix.fill(Q)
         if self._root is not None:
             self._matrix.matrix.diagonalScale(self._root, self._root)
@@ -276,7 +279,7 @@ class _VelocityForm:
     def correct(self, rest: NDArray, x: NDArray, goal: float) -> int:
         operator, work = self._operator, self._work
         # K u = D Q r
-        kernels.block_product.serial(self._Q, rest, work)
+        kernels.root_product.serial(self._root_of_Q, rest, work)
         self._b.getArray()[:] = operator.body_impulse(work).ravel()
         if self._root is not None:
             self._b.pointwiseMult(self._b, self._root)
@@ -289,7 +292,7 @@ class _VelocityForm:
         np.subtract(rest, work, out=work)
         self._y += work
         change = np.empty_like(work)
-        kernels.block_product.serial(self._Q, work, change)
+        kernels.root_product.serial(self._root_of_Q, work, change)
         x += change
         return iterations
 
@@ -364,7 +367,7 @@ class _ContactForm:
     def masked(self, s: NDArray) -> NDArray:
         return _without_tangents(s, self._frictionless)
 
-    def factor(self, Q: NDArray, R: NDArray) -> None:
+    def factor(self, Q: NDArray, R: NDArray, root: NDArray) -> None:
         if R.shape[1] > 1 and self._frictionless.size:
             R = R.copy()
             R[self._frictionless, 1:, :] = 0.0
@@ -619,6 +622,12 @@ def _block_diagonal(
 
 
 # ---- choices -------------------------------------------------------------------------------
+
+
+def _root(Q: NDArray) -> NDArray:
+    """Return L (m, c, c) with L L^T = Q, of positive semi-definite blocks."""
+    values, vectors = np.linalg.eigh(Q)
+    return vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
 
 
 def _choose_form(

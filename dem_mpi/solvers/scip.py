@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from dem_mpi import _kernels_scip as kernels
 from dem_mpi._kernels_solver import CHUNK, project
-from dem_mpi.cone import ConeProblem, Delassus, Residuals, Tolerance, evaluate, largest_of_ranks
+from dem_mpi.cone import ConeProblem, Residuals, Tolerance, evaluate, largest_of_ranks
 from dem_mpi.newton import LinearSolve, NewtonFailureError, NewtonOptions, NewtonSystem
 from dem_mpi.parallel import Parallel
 from dem_mpi.solvers.result import SolveReport
@@ -44,7 +44,7 @@ _WORTHWHILE = 1.01  # a corrector that does not lengthen the step by this factor
 # part; later iterations need it, as the condition of W grows with 1/mean.
 _MISFIT = 1e-3
 _REFINEMENTS = 4
-_LOOSE = 1e-6  # relative residual asked of a linear solve: the refinement here does the rest
+_LINEAR, _CORRECTION = 1e-9, 1e-3  # relative residuals asked of a solve, and of a refinement's
 _POOR_STEP = 0.05  # below it the direction of plain centring is tried instead
 _TINY_STEP = 1e-4
 _PATIENCE = 5  # tiny steps, or iterations without progress, in a row
@@ -60,7 +60,7 @@ class System(Protocol):
 
     def take(self, operator: Any, mu: NDArray) -> bool: ...
 
-    def factor(self, Q: NDArray, R: NDArray) -> None: ...
+    def factor(self, Q: NDArray, R: NDArray, root: NDArray) -> None: ...
 
     def solve(self, s: NDArray, out: NDArray, tolerance: float = ...) -> LinearSolve: ...
 
@@ -145,7 +145,8 @@ class Scip:
         Every decision is taken from numbers that are alike on all ranks.
         """
         path.start(gamma, run.g)
-        tiny, stalled, least_mean = 0, 0, math.inf
+        tiny, stalled = 0, 0
+        mean, residual = math.inf, math.inf
         for iteration in range(self.options.max_iterations + 1):
             path.impulse(gamma)
             improved = run.judge(gamma)
@@ -153,8 +154,9 @@ class Scip:
                 return "converged"
             if not path.rescale(run.g):
                 return "not a number in the iteration, or rounding left the cones"
-            stalled = 0 if improved or path.mean < 0.9 * least_mean else stalled + 1
-            least_mean = min(least_mean, path.mean)
+            falling = improved or path.mean < 0.9 * mean or path.residual < 0.9 * residual
+            stalled = 0 if falling else stalled + 1
+            mean, residual = min(mean, path.mean), min(residual, path.residual)
             if stalled >= _PATIENCE:
                 return "stalled: neither the residuals nor the complementarity fall any more"
             if iteration == self.options.max_iterations:
@@ -258,13 +260,13 @@ class _CentralPath:
         m, columns = shape = problem.b.shape
         self._x, self._y = np.empty(shape), np.empty(shape)
         self._eta, self._w, self._lam = np.empty(m), np.empty(shape), np.empty(shape)
-        self._Q, self._R = np.zeros((m, columns, columns)), np.zeros((m, columns, columns))
+        self._blocks = [np.zeros((m, columns, columns)) for _ in range(3)]
         self._now, self._trial = _Direction(shape), _Direction(shape)
         self._s, self._correction = np.empty(shape), np.zeros(shape)
         chunks = max(1, math.ceil(m / CHUNK))
         self._partial = [np.zeros(chunks), np.zeros((chunks, 2)), np.zeros((chunks, 3))]
         self._g = run.g
-        self.mean = math.inf
+        self.mean = self.residual = math.inf
 
     def start(self, gamma: NDArray, g: NDArray) -> None:
         """Collective. A point of the central path near gamma (in its cone) and its g."""
@@ -281,23 +283,25 @@ class _CentralPath:
     def rescale(self, g: NDArray) -> bool:
         """Collective. Scaling at the iterate, whose N gamma + b is g; False if it is no longer one.
 
-        Sets `mean`, x.y per contact.
+        Sets `mean`, x.y per contact [J], and `residual`, max |T^-1 g - y| [m/s].
         """
+        parallel = self._problem.parallel
         self._g = g
-        gap, least, _ = self._kernel(kernels.scaling)(
+        gap, outside, residual = self._kernel(kernels.scaling)(
             self._x, self._y, self._problem.mu, g, self._eta, self._w, self._lam, self._partial[2]
         )
-        found = np.array([-least if self._problem.contacts else np.inf, gap])
-        self.mean = self._problem.parallel.sum(gap) / self._run.contacts
-        bad = not math.isfinite(gap) or math.isnan(found[0]) or not self.mean > 0.0
-        return not self._problem.parallel.any(bad)
+        self.mean = parallel.sum(gap) / self._run.contacts
+        largest = np.array([residual, outside])
+        largest_of_ranks(largest, parallel)
+        self.residual = float(largest[0])
+        return largest[1] < math.inf and math.isfinite(self.residual) and 0.0 < self.mean < math.inf
 
     def advance(self, correctors: int) -> float:
         """Collective. Factorise, find a direction, step; return the step, NaN if there is none."""
         run, now = self._run, self._now
         with run.timed("factor"):
-            self._kernel(kernels.blocks)(self._eta, self._w, self._problem.mu, self._Q, self._R)
-            self._system.factor(self._Q, self._R)
+            self._kernel(kernels.blocks)(self._eta, self._w, self._problem.mu, *self._blocks)
+            self._system.factor(*self._blocks)
             run.factorisations += 1
         now.c[:] = 0.0
         self._find(now)
@@ -357,7 +361,7 @@ class _CentralPath:
         """Collective. Solve for d's right-hand side c, refined in the scaled space."""
         kernel, mu, partial = self._kernel, self._problem.mu, self._partial
         kernel(kernels.right_side)(self._g, self._eta, self._w, mu, d.c, self._s)
-        self._solve(d.dgamma)
+        residual = self._solve(d.dgamma, _LINEAR)
         last = math.inf
         for attempt in range(_REFINEMENTS + 1):
             self._problem.operator.apply(d.dgamma, d.dg)
@@ -375,19 +379,21 @@ class _CentralPath:
             blocking = max(found[0], found[1])
             d.longest = 1.0 / blocking if blocking > 0.0 else math.inf
             if not _MISFIT < misfit < 0.5 * last or attempt == _REFINEMENTS:
-                return
+                break
             last = misfit
             self._run.refinements += 1
-            self._solve(self._correction)
+            residual *= self._solve(self._correction, _CORRECTION)
             d.dgamma += self._correction
+        self._run.linear_residual = max(self._run.linear_residual, residual)
 
-    def _solve(self, out: NDArray) -> None:
+    def _solve(self, out: NDArray, tolerance: float) -> float:
+        """Collective. out = (N + R)^-1 s; return its relative residual."""
         run = self._run
         with run.timed("substitute"):
-            done = self._system.solve(self._s, out, _LOOSE)
-        run.linear_residual = max(run.linear_residual, done.residual)
+            done = self._system.solve(self._s, out, tolerance)
         run.refinements += done.refinements
         run.products += done.products
+        return done.residual
 
     def _kernel(self, kernel: Any) -> Callable:
         return kernel.using(self._problem.threads)
