@@ -35,8 +35,6 @@ from dem_mpi.cone import ConeProblem, Residuals, Tolerance, evaluate
 from dem_mpi.parallel import Parallel
 from dem_mpi.solvers.result import Solver, SolveReport
 
-# An impulse this close to the border of its cone counts as sliding: inner solvers leave a little.
-_SLIDING = 0.999
 # A cone problem left unsolved is gone on from while the merit falls to this part of the best.
 _PROGRESS = 0.5
 # Directions of past differences below this part of the largest, in squares, are noise.
@@ -55,12 +53,12 @@ class CoulombOptions:
     restart      : acceleration begins anew after a merit above this multiple of the smallest
     """
 
-    max_outer: int = 50
-    inner_factor: float = 0.1
+    max_outer: int = 100
+    inner_factor: float = 0.05
     finest: float = 0.5
     relaxation: float = 0.7
     memory: int = 5
-    restart: float = 2.0
+    restart: float = 10.0
 
 
 class Coulomb:
@@ -98,7 +96,8 @@ class Coulomb:
         gamma, g = _start(problem, guess)
         s = slip_bias(problem.mu, g)
         least = _merit(tolerance, law_residuals(problem, gamma, g), problem)
-        newton = 1.0 + options.relaxation * _single_contact_gain(problem)
+        diagonal = problem.operator.diagonal()
+        newton = 1.0 + options.relaxation * _single_contact_gain(problem.mu, diagonal)
         acceleration = _Anderson(options.memory, parallel)
         totals = _Totals()
         best: _Iterate | None = None
@@ -123,10 +122,10 @@ class Coulomb:
                 acceleration.restart()
             least = min(least, merit)
             r = slip_bias(problem.mu, g) - s
-            r *= np.where(_slides(problem.mu, gamma), newton, 1.0)
+            closed, slides = _standing(problem.mu, diagonal, gamma, g, r)
+            r[slides] *= newton[slides]
             # Where a contact stays open its bias is of no consequence, and no part of the fit.
-            matters = (gamma[:, 0] > 0.0) | (g[:, 0] < 0.0)
-            s = np.maximum(s + acceleration.step(s, r, matters), 0.0)
+            s = np.maximum(s + acceleration.step(s, r, closed), 0.0)
         return totals.report(best, reason, lipschitz)
 
     def destroy(self) -> None:
@@ -186,22 +185,33 @@ def _merit(tolerance: Tolerance, residuals: Residuals, problem: ConeProblem) -> 
     return tolerance.merit(residuals, problem) if residuals.finite else math.inf
 
 
-def _single_contact_gain(problem: ConeProblem) -> NDArray:
+def _single_contact_gain(mu: NDArray, diagonal: NDArray) -> NDArray:
     """mu^2 N_tt/N_nn (m,): what 1/(1 - dF/ds) exceeds 1 by for a sliding contact on its own."""
-    diagonal = problem.operator.diagonal()
-    return problem.mu**2 * diagonal[:, 1:].mean(axis=1) / diagonal[:, 0]
+    normal = diagonal[:, 0]
+    tangential = mu**2 * diagonal[:, 1:].mean(axis=1)
+    return np.divide(tangential, normal, out=np.zeros_like(mu), where=normal > 0.0)
 
 
-def _slides(mu: NDArray, gamma: NDArray) -> NDArray:
-    """Which contacts (m,) have an impulse on the border of their cone, its apex excepted."""
-    tangential = np.sqrt(gamma[:, 1] * gamma[:, 1] + gamma[:, 2] * gamma[:, 2])
-    return (gamma[:, 0] > 0.0) & (tangential >= _SLIDING * mu * gamma[:, 0])
+def _standing(
+    mu: NDArray, diagonal: NDArray, gamma: NDArray, g: NDArray, r: NDArray
+) -> tuple[NDArray, NDArray]:
+    """Which contacts (m,) are closed, and which of these slide.
+
+    Of two numbers whose product the solution makes zero the larger decides, impulses times diag(N):
+    an interior point solver leaves both positive. g_n - r is what a contact opens at beyond the
+    border of C*, mu gamma_n - |gamma_t| what its impulse lacks to that of C.
+    """
+    push = np.sqrt(gamma[:, 1] * gamma[:, 1] + gamma[:, 2] * gamma[:, 2])
+    slip = np.sqrt(g[:, 1] * g[:, 1] + g[:, 2] * g[:, 2])
+    closed = (diagonal[:, 0] * gamma[:, 0] > g[:, 0] - r) | (g[:, 0] < 0.0)
+    lacking = diagonal[:, 1:].mean(axis=1) * (mu * gamma[:, 0] - push)
+    return closed, closed & (slip > lacking)
 
 
 class _Anderson:
     """Steps towards r(s) = 0 that differences of past (s, r) suggest.
 
-    With theta the weights for which |r - sum theta_j dr_j| is least, over the contacts that matter,
+    With theta the weights for which |r - sum theta_j dr_j| is least, over the closed contacts,
     the step is r - sum theta_j (ds_j + dr_j).
     """
 
@@ -215,10 +225,10 @@ class _Anderson:
         self._dr: list[NDArray] = []
         self._last: tuple[NDArray, NDArray] | None = None
 
-    def step(self, s: NDArray, r: NDArray, matters: NDArray) -> NDArray:
+    def step(self, s: NDArray, r: NDArray, closed: NDArray) -> NDArray:
         """Collective. The step from s (m,) with residual r (m,), kept as a part of the past.
 
-        It is r itself without a past, and for contacts where `matters` (m,) bool is False.
+        It is r itself without a past, and for contacts where `closed` (m,) bool is False.
         """
         if self._memory == 0:
             return r
@@ -230,14 +240,14 @@ class _Anderson:
         if k == 0:
             return r
         ds, dr = np.array(self._ds), np.array(self._dr)
-        fitted = dr * matters
+        fitted = dr * closed
         # Not by @: the order of a threaded BLAS's sums may change from one call to the next.
         products = np.empty((k, k + 1))
         products[:, :k] = np.einsum("im,jm->ij", fitted, fitted)
         products[:, k] = np.einsum("im,m->i", fitted, r)
         self._parallel.sum_in_place(products)
         theta = self._parallel.broadcast(_weights(products[:, :k], products[:, k]))
-        return r - np.einsum("i,im->m", theta, ds + dr) * matters
+        return r - np.einsum("i,im->m", theta, ds + dr) * closed
 
 
 def _weights(gram: NDArray, rhs: NDArray) -> NDArray:
