@@ -14,7 +14,7 @@ from dem_mpi.parallel import Parallel
 
 PREFIX = "scip_"
 Ordering = Literal["auto", "amd", "metis", "scotch", "pord"]
-Preconditioner = Literal["block_jacobi", "icc"]
+Preconditioner = Literal["block_jacobi", "icc", "low_rank"]
 
 # MUMPS numbers its orderings (its users' guide, ICNTL(7)).
 _ORDERINGS = {"amd": 0, "scotch": 3, "pord": 4, "metis": 5, "auto": 7}
@@ -25,6 +25,7 @@ _NO_MEMORY = (-5, -7, -13, -19)
 _RETRY_FACTOR = 4  # times as much extra space, once
 _MEGABYTE = 1e6
 _ITERATIONS = 10_000  # of conjugate gradients, at most, for one right-hand side
+_DROPPED = 1e-2  # relative size of what a low-rank factor leaves out (CNTL(7))
 _SMALLEST_RELATIVE = 1e-16  # below it no residual falls
 # Memory of MUMPS's analysis on rank 0: row and column of each entry of one triangle, read from all
 # ranks, and about as much again for the graph that is ordered [B per entry of the matrix].
@@ -104,8 +105,8 @@ class Direct:
 
         self._ksp = PETSc.KSP().create(self._parallel.communicator)
         self._ksp.setOptionsPrefix(PREFIX)
-        self._ksp.setType(PETSc.KSP.Type.PREONLY)
         self._ksp.setOperators(self._matrix)
+        self._choose_method(PETSc)
         pc = self._ksp.getPC()
         pc.setType(PETSc.PC.Type.CHOLESKY if self._symmetric else PETSc.PC.Type.LU)
         pc.setFactorSolverType(PETSc.Mat.SolverType.MUMPS)
@@ -118,6 +119,7 @@ class Direct:
             factor.setMumpsIcntl(15, -self._block)
         if self._options.memory is not None:
             factor.setMumpsIcntl(23, max(1, int(self._options.memory)))
+        self._adjust(factor)
         self._ksp.setFromOptions()
         self.analyses += 1
         # PETSC_OPTIONS of the user go first. PETSc sets this one anew when it starts MUMPS, by the
@@ -129,6 +131,12 @@ class Direct:
         self._ksp.setUp()
         if not given:
             options.delValue(key)
+
+    def _choose_method(self, petsc: Any) -> None:
+        self._ksp.setType(petsc.KSP.Type.PREONLY)
+
+    def _adjust(self, factor: Any) -> None:
+        """Change what differs in a derived class."""
 
     def set_up(self) -> None:
         """Collective. Factorise; a first time, analyse too. Once more if the space ran out."""
@@ -200,6 +208,31 @@ class Direct:
             self._ksp = None
 
 
+class LowRank(Direct):
+    """Conjugate gradients with an approximate factor: blocks of low rank up to a tolerance.
+
+    Far blocks of the factor are compressed; it has fewer entries and operations than an exact one,
+    the more so the larger it is, and a few iterations make up for what was dropped.
+    """
+
+    def _choose_method(self, petsc: Any) -> None:
+        self._ksp.setType(petsc.KSP.Type.CG)
+        self._ksp.setNormType(petsc.KSP.NormType.UNPRECONDITIONED)
+
+    def _adjust(self, factor: Any) -> None:
+        factor.setMumpsIcntl(35, 2)
+        factor.setMumpsCntl(7, _DROPPED)
+
+    def set_up(self) -> None:
+        """Collective. As of an exact factor; `entries` are those left."""
+        super().set_up()
+        self.entries = _count(self._ksp.getPC().getFactorMatrix().getMumpsInfog(35))
+
+    def solve(self, b: Any, x: Any, goal: float) -> int:
+        """Collective. Iterate from zero; what is missing at the end, the caller's residual says."""
+        return _iterate(self._ksp, b, x, goal)
+
+
 class Iterative:
     """Conjugate gradients, of a matrix marked SPD, with a preconditioner of few operations.
 
@@ -212,7 +245,7 @@ class Iterative:
         """Collective."""
         from petsc4py import PETSc
 
-        self._matrix, self._reasons = matrix, PETSc.KSP.ConvergedReason
+        self._matrix = matrix
         self._ksp = PETSc.KSP().create(parallel.communicator)
         self._ksp.setOptionsPrefix(PREFIX)
         self._ksp.setType(PETSc.KSP.Type.CG)
@@ -232,19 +265,24 @@ class Iterative:
 
     def solve(self, b: Any, x: Any, goal: float) -> int:
         """Collective. Iterate from zero; what is missing at the end, the caller's residual says."""
-        self._ksp.setTolerances(rtol=_SMALLEST_RELATIVE, atol=goal, max_it=_ITERATIONS)
-        self._ksp.solve(b, x)
-        reason = self._ksp.getConvergedReason()
-        if reason in (self._reasons.DIVERGED_NANORINF, self._reasons.DIVERGED_PCSETUP_FAILED):
-            raise NewtonFailureError(
-                "the conjugate gradients of a Newton system broke down: set contact.scip.linear: "
-                "mumps, or another contact.scip.preconditioner"
-            )
-        return self._ksp.getIterationNumber()
+        return _iterate(self._ksp, b, x, goal)
 
     def destroy(self) -> None:
         """Collective. Free the PETSc objects."""
         self._ksp.destroy()
+
+
+def _iterate(ksp: Any, b: Any, x: Any, goal: float) -> int:
+    """Collective. Run conjugate gradients to |b - K x| <= goal; return the iterations."""
+    ksp.setTolerances(rtol=_SMALLEST_RELATIVE, atol=goal, max_it=_ITERATIONS)
+    ksp.solve(b, x)
+    reasons = ksp.ConvergedReason
+    if ksp.getConvergedReason() in (reasons.DIVERGED_NANORINF, reasons.DIVERGED_PCSETUP_FAILED):
+        raise NewtonFailureError(
+            "the conjugate gradients of a Newton system broke down: set contact.scip.linear: "
+            "mumps, or another contact.scip.preconditioner"
+        )
+    return ksp.getIterationNumber()
 
 
 def _choose_incomplete_cholesky(pc: Any, petsc: Any) -> None:

@@ -29,6 +29,7 @@ from dem_mpi.linear_solvers import (
     DirectOptions,
     Iterative,
     LinearSolver,
+    LowRank,
     NewtonFailureError,
     Ordering,
     Preconditioner,
@@ -56,8 +57,8 @@ class NewtonOptions:
     ordering  : of the elimination; one that this MUMPS was built without is replaced by its choice
     workspace : extra working space of MUMPS [%]
     memory    : limit of MUMPS's memory on each rank [MB]
-    preconditioner : of conjugate gradients: the blocks of the bodies inverted, or an incomplete
-                Cholesky factor of each rank's rows
+    preconditioner : of conjugate gradients: the blocks of the bodies inverted, an incomplete
+                Cholesky factor of each rank's rows, or a factor by MUMPS with blocks of low rank
     """
 
     form: Literal["auto", "velocity", "contact"] = "auto"
@@ -240,10 +241,13 @@ class _VelocityForm:
         self, operator: Any, mu: NDArray, parallel: Parallel, options: NewtonOptions
     ) -> None:
         self._operator, self._parallel = operator, parallel
-        self._matrix = _ContactVelocityMatrix(operator, parallel)
-        self._frictionless = _frictionless_rows(mu, operator)
+        known = isinstance(operator, MatrixFree | Assembled)
+        matrix = _ContactVelocityMatrix if known else _ProductVelocityMatrix
+        self._matrix = matrix(operator, parallel)
+        self._frictionless = _frictionless_rows(mu)
+        symmetric = getattr(operator, "symmetric", True)
         self.solver = _linear_solver(
-            self._matrix.matrix, self._matrix.block, True, options, parallel
+            self._matrix.matrix, self._matrix.block, symmetric, options, parallel
         )
         self._b, self._u = self._matrix.matrix.createVecs()
         # M^-1/2, by which an iterative solver has K scaled: its residual r is then that of
@@ -258,7 +262,7 @@ class _VelocityForm:
         if not self._matrix.take(operator):
             return False
         self._operator = operator
-        self._frictionless = _frictionless_rows(mu, operator)
+        self._frictionless = _frictionless_rows(mu)
         return True
 
     def masked(self, s: NDArray) -> NDArray:
@@ -346,7 +350,7 @@ class _ContactForm:
     def _take_geometry(self, operator: Any, mu: NDArray) -> None:
         """Collective. N, with zeros in the rows and columns of tangents without friction."""
         self._operator = operator
-        self._frictionless = _frictionless_rows(mu, operator)
+        self._frictionless = _frictionless_rows(mu)
         self._N = operator.delassus()
         # The blocks of R must have their place, also where N happens to have none.
         zeros, self._indptr, self._indices = _block_diagonal(
@@ -678,17 +682,19 @@ def _linear_solver(
     matrix: Any, block: int, symmetric: bool, options: NewtonOptions, parallel: Parallel
 ) -> LinearSolver:
     """Collective."""
+    direct = DirectOptions(options.ordering, options.workspace, options.memory)
     if options.linear == "cg":
         if not symmetric:
             raise NewtonFailureError(
                 "contact.scip.linear: cg needs a symmetric M, and this problem's is not: set mumps"
             )
-        return Iterative(matrix, options.preconditioner, parallel)
-    direct = DirectOptions(options.ordering, options.workspace, options.memory)
+        if options.preconditioner != "low_rank":
+            return Iterative(matrix, options.preconditioner, parallel)
+        return LowRank(matrix, block, symmetric, direct, parallel)
     return Direct(matrix, block, symmetric, direct, parallel)
 
 
-def _frictionless_rows(mu: NDArray, operator: Any) -> NDArray:
+def _frictionless_rows(mu: NDArray) -> NDArray:
     """Return the contacts (k,) whose tangential unknowns are fixed at zero."""
     return np.flatnonzero(mu == 0.0)
 
