@@ -442,7 +442,8 @@ class _Graph:
         number[: bodies.owned, 1] = parallel.rank
         bodies.forward(number)
         joined = contacts.b >= 0
-        owner = np.where(joined, number[contacts.b, 1], parallel.rank) if rows else contacts.b
+        other = np.maximum(contacts.b, 0)  # walls have negative ids, and no row
+        owner = np.where(joined, number[other, 1], parallel.rank) if rows else contacts.b
         abroad = np.unique(owner[owner != parallel.rank]).tolist() if rows else []
         halo = Halo.build(parallel, contacts.count, {r: np.flatnonzero(owner == r) for r in abroad})
         body = np.full((halo.owned + halo.ghosts, 2), -1, dtype=np.int64)
