@@ -47,6 +47,9 @@ _REFINEMENTS = 4
 _LINEAR, _CORRECTION = 1e-9, 1e-3  # relative residuals asked of a solve, and of a refinement's
 _POOR_STEP = 0.05  # below it the direction of plain centring is tried instead
 _TINY_STEP = 1e-4
+# Poor steps that leave most of the residual tell that impulses are far larger than those of the
+# start: begin again from higher on the central path.
+_SHORT_STEP, _HIGHER, _RESTARTS = 0.2, 1e4, 4
 _PATIENCE = 5  # tiny steps, or iterations without progress, in a row
 
 
@@ -145,8 +148,8 @@ class Scip:
         Every decision is taken from numbers that are alike on all ranks.
         """
         path.start(gamma, run.g)
-        tiny, stalled = 0, 0
-        mean, residual = math.inf, math.inf
+        tiny, stalled, restarts = 0, 0, 0
+        mean, residual, first = math.inf, math.inf, math.inf
         for iteration in range(self.options.max_iterations + 1):
             path.impulse(gamma)
             improved = run.judge(gamma)
@@ -165,6 +168,12 @@ class Scip:
             step = path.advance(self.options.correctors)
             if not math.isfinite(step):
                 return "not a number in the Newton step"
+            first = path.residual if iteration == 0 else first
+            if step < _SHORT_STEP and path.residual > 0.1 * first and restarts < _RESTARTS:
+                restarts += 1
+                path.start(gamma, run.g, _HIGHER * path.target)
+                mean = math.inf
+                continue
             tiny = tiny + 1 if step < _TINY_STEP else 0
             if tiny >= _PATIENCE:
                 return "the steps became too small"
@@ -266,14 +275,19 @@ class _CentralPath:
         chunks = max(1, math.ceil(m / CHUNK))
         self._partial = [np.zeros(chunks), np.zeros((chunks, 2)), np.zeros((chunks, 3))]
         self._g = run.g
-        self.mean = self.residual = math.inf
+        self.mean = self.residual = self.target = math.inf
 
-    def start(self, gamma: NDArray, g: NDArray) -> None:
-        """Collective. A point of the central path near gamma (in its cone) and its g."""
+    def start(self, gamma: NDArray, g: NDArray, target: float | None = None) -> None:
+        """Collective. The point of the central path nearest to gamma (in its cone) and its g.
+
+        target : x.y of a contact [J]; from how far gamma is from a solution if not given
+        """
         mu = self._problem.mu
         stiffness = self._problem.operator.diagonal()[:, 0].copy()
-        total = self._kernel(kernels.distance)(gamma, g, mu, stiffness, self._partial[0])
-        target = _START * self._problem.parallel.sum(total) / self._run.contacts
+        if target is None:
+            total = self._kernel(kernels.distance)(gamma, g, mu, stiffness, self._partial[0])
+            target = _START * self._problem.parallel.sum(total) / self._run.contacts
+        self.target = target
         self._kernel(kernels.centred_start)(gamma, g, mu, stiffness, target, self._x, self._y)
 
     def impulse(self, gamma: NDArray) -> None:

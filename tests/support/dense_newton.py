@@ -52,7 +52,10 @@ class DenseNewton:
             raise NewtonFailureError("the Newton matrix is not finite")
         self._scale = 1.0 / np.sqrt(np.diag(A))
         self._A = A * self._scale * self._scale[:, None]
-        self._inverse = np.linalg.inv(self._A)
+        try:
+            self._inverse = np.linalg.inv(self._A)
+        except np.linalg.LinAlgError:
+            raise NewtonFailureError("the Newton matrix is singular") from None
         self.factor_entries = self._A.size
 
     def solve(self, s: NDArray, out: NDArray, tolerance: float = 1e-10) -> LinearSolve:
