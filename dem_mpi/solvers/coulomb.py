@@ -35,6 +35,8 @@ from dem_mpi.cone import ConeProblem, Residuals, Tolerance, evaluate
 from dem_mpi.parallel import Parallel
 from dem_mpi.solvers.result import Solver, SolveReport
 
+# Merits below this are taken for it when the tolerance of a cone problem is set.
+_LAST = 10.0
 # A cone problem left unsolved is gone on from while the merit falls to this part of the best.
 _PROGRESS = 0.5
 # Directions of past differences below this part of the largest, in squares, are noise.
@@ -46,16 +48,17 @@ class CoulombOptions:
     """Options of `Coulomb`.
 
     max_outer    : cone problems at most
-    inner_factor : each is solved to this part of the smallest merit so far: early ones coarsely
-    finest       : but never below this part of the tolerance, which leaves the rest to the bias
+    coarsest     : each is solved to this part of the smallest merit so far, early ones coarsely;
+                   a merit below 10 tolerances counts as 10: the bias has its share in the last one
+    finest       : the part is halved down to this while the merit does not
     relaxation   : part of the over-relaxation mu^2 N_tt/N_nn that a contact alone would ask for
     memory       : past differences that Anderson acceleration combines; 0 switches it off
     restart      : acceleration begins anew after a merit above this multiple of the smallest
     """
 
     max_outer: int = 100
-    inner_factor: float = 0.05
-    finest: float = 0.5
+    coarsest: float = 0.05
+    finest: float = 0.02
     relaxation: float = 0.7
     memory: int = 5
     restart: float = 10.0
@@ -96,15 +99,19 @@ class Coulomb:
         gamma, g = _start(problem, guess)
         s = slip_bias(problem.mu, g)
         least = _merit(tolerance, law_residuals(problem, gamma, g), problem)
+        least = least if math.isfinite(least) else _LAST
         diagonal = problem.operator.diagonal()
+        part = options.coarsest
         newton = 1.0 + options.relaxation * _single_contact_gain(problem.mu, diagonal)
         acceleration = _Anderson(options.memory, parallel)
         totals = _Totals()
         best: _Iterate | None = None
         reason = "reached the limit of outer iterations"
         while totals.outer < options.max_outer:
+            # A guess that obeys the law already is taken as it is.
+            finer = part * max(least, _LAST) if least > 1.0 else 1.0
             report = self.inner.solve(
-                _biased(problem, s), gamma.copy(), lipschitz, self._finer(tolerance, least)
+                _biased(problem, s), gamma.copy(), lipschitz, _times(tolerance, finer)
             )
             gamma, g, lipschitz = report.impulse, _lifted(report.velocity, -s), report.lipschitz
             residuals = law_residuals(problem, gamma, g)
@@ -120,6 +127,8 @@ class Coulomb:
                 break
             if merit > options.restart * best.merit:
                 acceleration.restart()
+            if merit > _PROGRESS * least:
+                part = max(0.5 * part, min(options.finest, options.coarsest))
             least = min(least, merit)
             r = slip_bias(problem.mu, g) - s
             closed, slides = _standing(problem.mu, diagonal, gamma, g, r)
@@ -131,14 +140,6 @@ class Coulomb:
     def destroy(self) -> None:
         """Collective. Free what the inner solver keeps between solves."""
         self.inner.destroy()
-
-    def _finer(self, tolerance: Tolerance, merit: float) -> Tolerance:
-        """Return the tolerance of a cone problem after iterates of this merit at best."""
-        part = max(self.options.finest, self.options.inner_factor * merit)
-        if merit <= 1.0 or not math.isfinite(merit):
-            part = 1.0
-        value, work = part * tolerance.value, part * tolerance.relative_work
-        return replace(tolerance, value=value, relative_work=work)
 
 
 def slip_bias(mu: NDArray, g: NDArray) -> NDArray:
@@ -179,6 +180,11 @@ def _start(problem: ConeProblem, guess: NDArray) -> tuple[NDArray, NDArray]:
     problem.operator.apply(gamma, g)
     g += problem.b
     return gamma, g
+
+
+def _times(tolerance: Tolerance, factor: float) -> Tolerance:
+    value, work = factor * tolerance.value, factor * tolerance.relative_work
+    return replace(tolerance, value=value, relative_work=work)
 
 
 def _merit(tolerance: Tolerance, residuals: Residuals, problem: ConeProblem) -> float:

@@ -184,7 +184,7 @@ def sheared_bed(
 ) -> ShearRecord:
     """Collective. Go on from a `pressed_bed` of that count and length for skip + time [s].
 
-    The state stays as it is. What is measured begins after `skip`, when the bed has got used to the law
+    The state stays as it is. Measuring begins after `skip`, when the bed has got used to the law
     and the step.
     """
     scenario = _shear_box(law, step, count, length, overrides)
