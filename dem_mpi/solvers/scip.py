@@ -47,9 +47,9 @@ _REFINEMENTS = 4
 _LINEAR, _CORRECTION = 1e-9, 1e-3  # relative residuals asked of a solve, and of a refinement's
 _POOR_STEP = 0.05  # below it the direction of plain centring is tried instead
 _TINY_STEP = 1e-4
-# Poor steps that leave most of the residual tell that impulses are far larger than those of the
-# start: begin again from higher on the central path.
-_SHORT_STEP, _HIGHER, _RESTARTS = 0.2, 1e4, 4
+# Short steps, while this part of the first residual is left, tell that impulses are far larger than
+# those of the start: begin again, this much higher on the central path.
+_SHORT_STEP, _UNTOUCHED, _HIGHER, _RESTARTS = 0.2, 1e-3, 1e4, 4
 _PATIENCE = 5  # tiny steps, or iterations without progress, in a row
 
 
@@ -169,7 +169,7 @@ class Scip:
             if not math.isfinite(step):
                 return "not a number in the Newton step"
             first = path.residual if iteration == 0 else first
-            if step < _SHORT_STEP and path.residual > 0.1 * first and restarts < _RESTARTS:
+            if step < _SHORT_STEP and path.residual > _UNTOUCHED * first and restarts < _RESTARTS:
                 restarts += 1
                 path.start(gamma, run.g, _HIGHER * path.target)
                 mean = math.inf
