@@ -40,9 +40,12 @@ def make_solver(options: SolverOptions) -> Solver:
     inner = _cone_solver(options)
     if options.law == "ccp":
         return inner
-    from dem_mpi.solvers.coulomb import Coulomb
+    from dem_mpi.solvers.coulomb import Coulomb, CoulombOptions
 
-    return Coulomb(inner, options.tolerance)
+    # Digits are cheap by Newton's method: fewer cone problems, each solved more closely.
+    part = 1e-3 if options.solver == "scip" else CoulombOptions.coarsest
+    schedule = CoulombOptions(coarsest=part, finest=min(part, CoulombOptions.finest))
+    return Coulomb(inner, options.tolerance, schedule)
 
 
 def _cone_solver(options: SolverOptions) -> Solver:

@@ -129,7 +129,7 @@ class Coulomb:
                 acceleration.restart()
             if merit > _PROGRESS * least:
                 part = max(0.5 * part, min(options.finest, options.coarsest))
-            least = min(least, merit)
+            least = best.merit
             r = slip_bias(problem.mu, g) - s
             closed, slides = _standing(problem.mu, diagonal, gamma, g, r)
             r[slides] *= newton[slides]
