@@ -50,6 +50,9 @@ _TINY_STEP = 1e-4
 # Short steps, while this part of the first residual is left, tell that impulses are far larger than
 # those of the start: begin again, this much higher on the central path.
 _SHORT_STEP, _UNTOUCHED, _HIGHER, _RESTARTS = 0.2, 1e-3, 1e4, 4
+_NO_FURTHER = (
+    "rounding lets it go no further, or bodies are jammed so that no finite impulse parts them"
+)
 _PATIENCE = 5  # tiny steps, or iterations without progress, in a row
 
 
@@ -75,7 +78,8 @@ class ScipOptions:
     """Options of `Scip`.
 
     max_iterations : factorisations
-    correctors     : largest number of centrality correctors an iteration; each costs a solve
+    correctors     : largest number of centrality correctors an iteration; each costs a solve, so
+                     that conjugate gradients, where solves are what costs, do without
     """
 
     tolerance: Tolerance = field(default_factory=Tolerance)
@@ -147,6 +151,8 @@ class Scip:
 
         Every decision is taken from numbers that are alike on all ranks.
         """
+        direct = self.options.newton.linear != "cg"
+        correctors = self.options.correctors if direct else 0
         path.start(gamma, run.g)
         tiny, stalled, restarts = 0, 0, 0
         mean, residual, first = math.inf, math.inf, math.inf
@@ -161,11 +167,11 @@ class Scip:
             stalled = 0 if falling else stalled + 1
             mean, residual = min(mean, path.mean), min(residual, path.residual)
             if stalled >= _PATIENCE:
-                return "stalled: neither the residuals nor the complementarity fall any more"
+                return f"stalled: residuals and complementarity fall no more; {_NO_FURTHER}"
             if iteration == self.options.max_iterations:
                 break
             run.iterations += 1
-            step = path.advance(self.options.correctors)
+            step = path.advance(correctors)
             if not math.isfinite(step):
                 return "not a number in the Newton step"
             first = path.residual if iteration == 0 else first
@@ -176,7 +182,7 @@ class Scip:
                 continue
             tiny = tiny + 1 if step < _TINY_STEP else 0
             if tiny >= _PATIENCE:
-                return "the steps became too small"
+                return f"the steps became too small; {_NO_FURTHER}"
         return "reached the iteration limit"
 
 
@@ -258,7 +264,7 @@ class _Direction:
         self.dgamma, self.dg = np.zeros(shape), np.zeros(shape)
         self.u, self.v = np.zeros(shape), np.zeros(shape)
         self.c = np.zeros(shape)
-        self.longest = 0.0
+        self.longest = self.residual = 0.0
 
 
 class _CentralPath:
@@ -330,6 +336,7 @@ class _CentralPath:
             self._centred()
         now = self._now
         step = min(1.0, now.longest * (0.9 + 0.09 * min(now.longest, 1.0)))
+        run.linear_residual = max(run.linear_residual, now.residual)
         if math.isfinite(step):
             self._kernel(kernels.advance)(
                 self._x, self._y, now.dgamma, now.dg, self._g, self._problem.mu, step, step
@@ -375,7 +382,7 @@ class _CentralPath:
         """Collective. Solve for d's right-hand side c, refined in the scaled space."""
         kernel, mu, partial = self._kernel, self._problem.mu, self._partial
         kernel(kernels.right_side)(self._g, self._eta, self._w, mu, d.c, self._s)
-        residual = self._solve(d.dgamma, _LINEAR)
+        d.residual = self._solve(d.dgamma, _LINEAR)
         last = math.inf
         for attempt in range(_REFINEMENTS + 1):
             self._problem.operator.apply(d.dgamma, d.dg)
@@ -396,9 +403,8 @@ class _CentralPath:
                 break
             last = misfit
             self._run.refinements += 1
-            residual *= self._solve(self._correction, _CORRECTION)
+            d.residual *= self._solve(self._correction, _CORRECTION)
             d.dgamma += self._correction
-        self._run.linear_residual = max(self._run.linear_residual, residual)
 
     def _solve(self, out: NDArray, tolerance: float) -> float:
         """Collective. out = (N + R)^-1 s; return its relative residual."""
