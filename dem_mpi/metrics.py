@@ -145,7 +145,7 @@ class Progress:
         left = pace * (self._steps - record["step"])
         text = (
             f"step {record['step']}/{self._steps}  t = {record['time']:.6g}/{end_time:.6g} s  "
-            f"contacts {record['contacts']:,}  iterations {record['iterations']}  "
+            f"contacts {record['contacts']:,}  {_iterations(record)}  "
             f"r_d {record['r_d']:.1e} m/s  {pace:.3g} s/step  remaining {_duration(left)}"
         )
         if flagged:
@@ -162,6 +162,45 @@ class Progress:
         if not self._quiet and self._live and self._shown:
             sys.stdout.write("\n")
             sys.stdout.flush()
+
+
+def _iterations(record: dict[str, Any]) -> str:
+    """What the solver did in a step, in words; factorisations only where there were any."""
+    if not record["factorisations"]:
+        return f"iterations {record['iterations']}"
+    return (
+        f"{record['solver']}: iterations {record['iterations']}, "
+        f"factorisations {record['factorisations']}"
+    )
+
+
+class SolverCounts:
+    """How often each method made a step's impulses, and what all steps together took."""
+
+    def __init__(self) -> None:
+        self._steps: dict[str, int] = {}
+        self._iterations = self._factorisations = self._outer = 0
+
+    def add(self, solver: str, iterations: int, factorisations: int, outer: int) -> None:
+        """Count one step."""
+        self._steps[solver] = self._steps.get(solver, 0) + 1
+        self._iterations += iterations
+        self._factorisations += factorisations
+        self._outer += outer
+
+    def facts(self) -> list[str]:
+        """Lines for the closing table; none where gradients alone solved one problem a step."""
+        steps = sum(self._steps.values())
+        if not self._factorisations and self._outer <= steps:
+            return []
+        by = ", ".join(f"{name} in {count:,} steps" for name, count in sorted(self._steps.items()))
+        gradients = self._iterations - self._factorisations
+        parts = [f"solved by {by}", f"{gradients:,} gradient iterations"]
+        if self._factorisations:
+            parts.append(f"{self._factorisations:,} Newton iterations, each with a factorisation")
+        if self._outer > steps:
+            parts.append(f"{self._outer:,} cone problems")
+        return ["; ".join(parts)]
 
 
 def _duration(seconds: float) -> str:

@@ -18,7 +18,14 @@ from dem_mpi.estimate import checkpoint_bytes, refuse_what_does_not_fit
 from dem_mpi.h5files import OutputLock, require_space
 from dem_mpi.insertion import changed_count
 from dem_mpi.machine import memory_share
-from dem_mpi.metrics import PHASES, MetricsLog, Progress, closing_table, resident_memory
+from dem_mpi.metrics import (
+    PHASES,
+    MetricsLog,
+    Progress,
+    SolverCounts,
+    closing_table,
+    resident_memory,
+)
 from dem_mpi.output import Field, Series, Trajectory, describe, frame_bytes
 from dem_mpi.parallel import Parallel
 from dem_mpi.placement import place
@@ -97,6 +104,7 @@ class Run:
         self._stem = self._path.stem
         self._fields = trajectory_fields(loaded.scenario)
         self._bodies = body_count(loaded.scenario)
+        self._counts = SolverCounts()
         self._newest: Path | None = None  # checkpoint
         self._trajectory: Trajectory | None = None
         self._metrics: MetricsLog | None = None
@@ -253,6 +261,9 @@ class Run:
             while state.step < self._scenario.steps and not self._at_rest():
                 record = simulation.step()
                 self._note_rest(record)
+                self._counts.add(
+                    record.solver, record.iterations, record.factorisations, record.outer
+                )
                 self._record(record)
                 progress.show(asdict(record), self._scenario.time.end, state.flagged)
                 if self._parallel.any(stop.requested):
@@ -353,7 +364,7 @@ class Run:
         facts = [f"{self._trajectory.frames} frames in {self._path}"]
         if state.flagged:
             facts.append(f"{state.flagged} steps missed their tolerance and are flagged")
-        facts += self._comings_and_goings()
+        facts += self._counts.facts() + self._comings_and_goings()
         closing_table(self._parallel, self._simulation.timer, perf_counter() - self._started, facts)
 
     def _comings_and_goings(self) -> list[str]:

@@ -9,7 +9,13 @@ The rule. Gradients run free until they have taken `free` of the foretold price 
 method. From then on, at iterations a tenth apart, they go on only if what is left of them costs
 less than `patience` (1 - spent/limit) prices: leaving early is a mistake where they are about to
 end, so at first they must be far off, and the more is spent the less is believed. Whatever the
-forecasts say, no more than `limit` prices are spent before the change.
+forecasts say, no more than `limit` prices are spent before the change. What gradients have done is
+not lost then: from their iterate the interior point method takes about two thirds of its Newton
+iterations.
+
+Tried on the histories of gradients in beds of 500 and 2,000 spheres, falling to settled, to 0.1 to
+1e-8 m/s and for prices of 500 to 64,000 products: of the pairs in which gradients alone would cost
+0.1 to 30 prices, a solve costs more than 1.5 times the better method in one of 40, 2.1 at most.
 
 No clock decides, so a run repeats bit for bit; nothing is kept from one problem to the next.
 """
@@ -41,8 +47,8 @@ _PART_OF_MACHINE = 0.7  # that factors may take
 class AutoOptions:
     """When to change from gradients to the interior point method, see the module's text."""
 
-    free: float = 0.4
-    patience: float = 2.0
+    free: float = 0.5
+    patience: float = 1.5
     limit: float = 1.5
 
 
@@ -155,7 +161,8 @@ class Auto:
                 )
         limit = tolerance.value * (1.0 if tolerance.kind == "absolute" else problem.velocity_scale)
         decades = math.log10(max(1.0, problem.velocity_scale / limit)) if limit > 0.0 else 16.0
-        return work.interior_point_work(size, decades) / work.product_work(size), ""
+        price = work.interior_point_work(size, decades, newton.linear)
+        return price / work.product_work(size), ""
 
     def _more_gradients(
         self, problem: ConeProblem, parts: list[SolveReport], tolerance: Tolerance

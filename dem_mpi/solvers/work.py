@@ -44,6 +44,8 @@ class Costs:
     Of a factorisation:
       operation [s]; entry [s]; row [s per body]; visit [s per entry of a triangular solve]
       analysis [s per entry], once for a graph
+    Of conjugate gradients without a factor:
+      conjugate: products with the matrix in a Newton iteration; block [s per entry of that matrix]
     Of more ranks: message [s] per product and doubling of ranks; a factorisation is
     ranks^scaling faster.
     Of an interior point solve:
@@ -63,8 +65,10 @@ class Costs:
     row: float = 1.0e-5
     visit: float = 2.0e-9
     analysis: float = 2.5e-8
+    conjugate: float = 2000.0
+    block: float = 2.5e-9
     scaling: float = 0.75
-    iterations: float = 4.0
+    iterations: float = 5.0
     iterations_per_decade: float = 1.0
     memory: float = 12.0
 
@@ -181,16 +185,24 @@ def product_work(size: Size, costs: Costs = COSTS) -> float:
     return costs.call + vector * size.largest / size.threads + message
 
 
-def newton_work(size: Size, costs: Costs = COSTS) -> float:
+def newton_work(size: Size, linear: str = "mumps", costs: Costs = COSTS) -> float:
     """Seconds of an iteration of the interior point method."""
-    entries = factor_entries(size)
-    factor = factor_operations(size) * costs.operation + entries * costs.entry
-    factor += size.bodies * costs.row + entries * costs.visit * costs.solves
-    shared = factor / size.ranks**costs.scaling
+    if linear == "mumps":
+        entries = factor_entries(size)
+        shared = factor_operations(size) * costs.operation + entries * costs.entry
+        shared += size.bodies * costs.row + entries * costs.visit * costs.solves
+        shared /= size.ranks**costs.scaling
+    else:
+        entries = size.rows**2 * (size.bodies + 2 * size.contacts)
+        shared = costs.conjugate * costs.block * entries / size.ranks
+        shared += costs.conjugate * costs.message * math.log2(size.ranks)
     return shared + costs.newton_call + size.largest * costs.contact
 
 
-def interior_point_work(size: Size, decades: float, costs: Costs = COSTS) -> float:
+def interior_point_work(
+    size: Size, decades: float, linear: str = "mumps", costs: Costs = COSTS
+) -> float:
     """Seconds of a solve to a tolerance so many decades below the velocity scale."""
     iterations = costs.iterations + costs.iterations_per_decade * max(0.0, decades)
-    return iterations * newton_work(size, costs) + costs.analysis * factor_entries(size)
+    analysis = costs.analysis * factor_entries(size) if linear == "mumps" else 0.0
+    return iterations * newton_work(size, linear, costs) + analysis
