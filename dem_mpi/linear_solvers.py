@@ -22,7 +22,8 @@ _ORDERINGS = {"amd": 0, "scotch": 3, "pord": 4, "metis": 5, "auto": 7}
 _TOO_LITTLE_SPACE = (-8, -9, -14, -15, -17, -20)
 # Errors that say that memory is short, and INFOG(2) how much: entries, or -millions of them.
 _NO_MEMORY = (-5, -7, -13, -19)
-_RETRY_FACTOR = 4  # times as much extra space, once
+_RETRY_FACTOR = 4  # times as much extra space, once, and at least
+_RETRY_WORKSPACE = 100  # [%]
 _MEGABYTE = 1e6
 _ITERATIONS = 10_000  # of conjugate gradients, at most, for one right-hand side
 _DROPPED = 1e-2  # relative size of what a low-rank factor leaves out (CNTL(7))
@@ -143,7 +144,7 @@ class Direct:
         error = self._factorise()
         if error in _TOO_LITTLE_SPACE and self._options.memory is None:
             # PETSc does not factorise again with a factor that failed: begin anew.
-            self._workspace *= _RETRY_FACTOR
+            self._workspace = max(_RETRY_WORKSPACE, _RETRY_FACTOR * self._workspace)
             self.retries += 1
             self.destroy()
             error = self._factorise()
@@ -173,19 +174,17 @@ class Direct:
         code = f"(INFOG(1) = {error}, INFOG(2) = {detail})"
         limit = self._options.memory
         if error in _TOO_LITTLE_SPACE or error in _NO_MEMORY:
-            estimate = f"its analysis asks for {wanted} MB on the fullest rank" if wanted else ""
-            phase = "factorisation" if wanted else "analysis"
+            phase = "analysis" if error in (-5, -7) else "factorisation"
+            asks = f"; it asks for {wanted} MB on the fullest rank, " if wanted > 0 else "; "
             if limit is not None:
-                short = f"and contact.scip.memory allows {limit:g} MB: raise it"
+                remedy = f"contact.scip.memory allows {limit:g} MB: raise it"
             elif error in _NO_MEMORY:
-                short = "more than the machine gives: use more ranks on more nodes"
+                remedy = "the machine has less: use more ranks on more nodes"
             else:
-                short = (
-                    f"and {self._workspace} % on top were too little: raise contact.scip.workspace"
-                )
+                remedy = f"contact.scip.workspace of {self._workspace} % was too little: raise it"
             return (
-                f"{what}: too little memory in the {phase}; {estimate or 'its graph is too large'} "
-                f"{short}, try another contact.scip.ordering, or set contact.scip.linear: cg {code}"
+                f"{what}: too little memory in the {phase}{asks}{remedy}, try another "
+                f"contact.scip.ordering, or set contact.scip.linear: cg {code}"
             )
         if error in (-10, -40):
             return (

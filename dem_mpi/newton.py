@@ -66,7 +66,7 @@ class NewtonOptions:
     ordering: Ordering = "auto"
     workspace: int = 35
     memory: float | None = None
-    preconditioner: Preconditioner = "block_jacobi"
+    preconditioner: Preconditioner = "icc"
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ every_solver = pytest.mark.parametrize(
     [
         NewtonOptions(form="velocity"),
         NewtonOptions(form="contact"),
-        NewtonOptions(linear="cg"),
+        NewtonOptions(linear="cg", preconditioner="block_jacobi"),
         NewtonOptions(linear="cg", preconditioner="icc"),
         NewtonOptions(linear="cg", preconditioner="low_rank"),
     ],
@@ -482,7 +482,6 @@ def test_numbers_that_are_not_finite_are_refused_on_all_ranks(parallel, form):
     system.destroy()
 
 
-@pytest.mark.mpi(ranks=[1, 2])
 def test_singular_matrix_is_an_error_that_says_so(parallel):
     """One contact, and R = -N: a pivot that is exactly zero."""
     case = Spheres(parallel, SCENES["two"](), False)
@@ -525,6 +524,18 @@ def test_too_small_a_memory_limit_for_the_factor_alone(parallel):
     with pytest.raises(NewtonFailureError) as raised:
         case.solve(system)
     assert "factorisation" in str(raised.value) and "contact.scip.memory" in str(raised.value)
+    system.destroy()
+
+
+@pytest.mark.mpi(ranks=[1, 2])
+@both_forms
+def test_too_little_workspace_is_made_more_once(parallel, form):
+    """MUMPS is given less than it asks for; the second factorisation has enough."""
+    lattice = np.stack(np.meshgrid(*[np.arange(8) / 8.0] * 3, indexing="ij"), axis=-1)
+    case = Spheres(parallel, cloud(lattice.reshape(-1, 3) + 0.06, 0.063), True)
+    system = case.system(parallel, NewtonOptions(form=form, workspace=-60))
+    _, residual = case.solve(system)
+    assert residual <= 1e-13 and system.retries == 1
     system.destroy()
 
 
