@@ -10,14 +10,14 @@ method. From then on, at iterations a tenth apart, they go on only if what is le
 less than `patience` (1 - spent/limit) prices: leaving early is a mistake where they are about to
 end, so at first they must be far off, and the more is spent the less is believed. Whatever the
 forecasts say, no more than `limit` prices are spent before the change. What gradients have done is
-not always lost then: from their iterate the interior point method took 4 Newton iterations for 10 in
-a settled bed of 2,000 spheres, but 10 for 11 in one of 500 and 12 for 13 under a heavy load.
+not always lost then: from their iterate the interior point method took 4 Newton iterations for 10
+in a settled bed of 2,000 spheres, but 10 for 11 in one of 500 and 12 for 13 under a heavy load.
 
-The three numbers were chosen on histories of gradients in beds of 500 and 2,000 spheres, falling to
-settled, to 0.1 to 1e-8 m/s and for supposed prices of 500 to 64,000 products. On these, and counting
-nothing for the better start, one in 16 of the pairs in which gradients alone would cost 0.1 to 30
-prices costs more than 1.5 times the better method, 2.4 times at most. Other scenes may do worse; an
-error in the price adds to it.
+The three numbers were chosen on histories of gradients in beds of 500 and 2,000 spheres, falling
+to settled, to 0.1 to 1e-8 m/s and for supposed prices of 500 to 64,000 products. On these, and
+counting nothing for the better start, one in 16 of the pairs in which gradients alone would cost
+0.1 to 30 prices costs more than 1.5 times the better method, 2.4 times at most. Other scenes may
+do worse; an error in the price adds to it.
 
 No clock decides, so a run repeats bit for bit; nothing is kept from one problem to the next.
 """
