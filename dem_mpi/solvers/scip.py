@@ -121,13 +121,14 @@ class Scip:
         reason = "converged"
         run.judge(gamma)
         if run.contacts and not run.best_merit <= 1.0:
-            try:
-                with run.timed("assemble"):
-                    system = self._system_for(problem)
-                path = _CentralPath(problem, system, run)
-                reason = self._follow(path, run, gamma)
-            except NewtonFailureError as error:
-                reason = str(error)
+            warm = problem.parallel.any(bool(gamma.any()))
+            reason = self._attempt(run, gamma, cautious=warm)
+            if warm and not run.best_merit <= 1.0 and run.iterations < self.options.max_iterations:
+                # From near a solution whose impulses are not unique the way may be barred, where
+                # it is open from nothing.
+                gamma[:] = 0.0
+                run.judge(gamma)
+                reason = self._attempt(run, gamma, cautious=False)
         return run.report(reason, lipschitz, self._system, perf_counter() - started)
 
     def destroy(self) -> None:
@@ -146,9 +147,20 @@ class Scip:
             )
         return self._system
 
-    def _follow(self, path: _CentralPath, run: _Run, gamma: NDArray) -> str:
+    def _attempt(self, run: _Run, gamma: NDArray, cautious: bool) -> str:
+        """Collective. Follow the path from near `gamma`; return why it ended."""
+        try:
+            with run.timed("assemble"):
+                system = self._system_for(run.problem)
+            path = _CentralPath(run.problem, system, run)
+            return self._follow(path, run, gamma, cautious)
+        except NewtonFailureError as error:
+            return str(error)
+
+    def _follow(self, path: _CentralPath, run: _Run, gamma: NDArray, cautious: bool) -> str:
         """Collective. Iterate to the tolerance; return why it ended. `gamma` becomes the iterate.
 
+        `cautious` : give up on short steps, where it would otherwise begin again from higher up.
         Every decision is taken from numbers that are alike on all ranks.
         """
         direct = self.options.newton.linear != "cg"
@@ -156,7 +168,8 @@ class Scip:
         path.start(gamma, run.g)
         tiny, stalled, restarts = 0, 0, 0
         mean, residual, first = math.inf, math.inf, math.inf
-        for iteration in range(self.options.max_iterations + 1):
+        most = self.options.max_iterations - run.iterations
+        for iteration in range(most + 1):
             path.impulse(gamma)
             improved = run.judge(gamma)
             if run.best_merit <= 1.0:
@@ -168,7 +181,7 @@ class Scip:
             mean, residual = min(mean, path.mean), min(residual, path.residual)
             if stalled >= _PATIENCE:
                 return f"stalled: residuals and complementarity fall no more; {_NO_FURTHER}"
-            if iteration == self.options.max_iterations:
+            if iteration == most:
                 break
             run.iterations += 1
             step = path.advance(correctors)
@@ -176,6 +189,8 @@ class Scip:
                 return "not a number in the Newton step"
             first = path.residual if iteration == 0 else first
             if step < _SHORT_STEP and path.residual > _UNTOUCHED * first and restarts < _RESTARTS:
+                if cautious:
+                    return f"the steps became too small; {_NO_FURTHER}"
                 restarts += 1
                 path.start(gamma, run.g, _HIGHER * path.target)
                 mean = math.inf
