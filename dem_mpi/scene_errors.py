@@ -25,6 +25,7 @@ _BOUNDS = {
     "string_too_long": ("max_length", "must have at most {} characters"),
 }
 _UNION_MEMBERS = {"<number>", "<list>", "<uniform>", "<lognormal>", "<weighted>", "<mix>"}
+_TAG_STARTS = ("literal[", "tuple[", "[key]")
 _KINDS = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -71,7 +72,7 @@ def explain(error: ValidationError, document: Document, schema: Schema) -> Input
     wrong = [finding["loc"] for finding in findings]
     first = min(
         (f for f in findings if not (f["type"] == "too_short" and _holds(f["loc"], wrong))),
-        key=lambda finding: order.get(finding["type"], 1),
+        key=lambda finding: (_misses_a_word(finding), order.get(finding["type"], 1)),
     )
     path = _without_tags(first["loc"])
     if first["type"] == "missing" and isinstance(path[-1], int):
@@ -79,6 +80,11 @@ def explain(error: ValidationError, document: Document, schema: Schema) -> Input
     if first["type"] == "union_tag_invalid":
         path = (*path, "shape")
     return InputError(message(document, path, _rule(first, path, document, schema)))
+
+
+def _misses_a_word(finding: Any) -> bool:
+    """Whether no text was written where a word may stand: then something else was meant."""
+    return finding["type"] == "literal_error" and not isinstance(finding["input"], str)
 
 
 def _holds(location: tuple, others: Iterable[tuple]) -> bool:
@@ -91,7 +97,12 @@ def _without_tags(location: tuple[str | int, ...]) -> KeyPath:
     """Pydantic's location without the names of union members and the marks of dict keys."""
     if location[:1] == ("walls",) and len(location) > 2:
         location = location[:2] + location[3:]
-    return tuple(key for key in location if key not in _UNION_MEMBERS and key != "[key]")
+    return tuple(key for key in location if not _is_tag(key))
+
+
+def _is_tag(key: str | int) -> bool:
+    """Whether a part of pydantic's location names a union's member, or the key of a mapping."""
+    return isinstance(key, str) and (key in _UNION_MEMBERS or key.startswith(_TAG_STARTS))
 
 
 def _rule(finding: Any, path: KeyPath, document: Document, schema: Schema) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from pydantic import ValidationInfo, field_validator
 
 from dem_mpi.scene_base import (
     Model,
@@ -106,6 +107,11 @@ class Scip(Model):
     linear: Literal["mumps", "cg"] = note(
         "Newton systems by Cholesky factors, or by conjugate gradients", default="mumps"
     )
+    preconditioner: Literal["icc", "block_jacobi", "low_rank"] = note(
+        "Of conjugate gradients: incomplete Cholesky factors, one a rank; the 6 x 6 blocks of the "
+        "bodies; or Cholesky factors with far blocks of low rank, less memory than full ones",
+        default="icc",
+    )
     ordering: Literal["auto", "amd", "metis", "scotch", "pord"] = note(
         "Fill-reducing ordering of the factorisation", default="auto"
     )
@@ -115,6 +121,13 @@ class Scip(Model):
     memory: Positive | None = quantity(
         "MB", "Memory a rank may use for factors at most; null: no limit", default=None
     )
+
+    @field_validator("linear")
+    @classmethod
+    def _form_fits(cls, linear: str, info: ValidationInfo) -> str:
+        if linear == "cg" and info.data.get("form") == "contact":
+            raise ValueError("cg solves for velocities of bodies: set form: velocity or auto")
+        return linear
 
 
 class Contact(Model):

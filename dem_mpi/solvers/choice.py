@@ -72,6 +72,7 @@ def _scip(options: SolverOptions) -> Scip:
     newton = NewtonOptions(
         form=section.form,
         linear=section.linear,
+        preconditioner=section.preconditioner,
         ordering=section.ordering,
         workspace=section.workspace,
         memory=section.memory,

@@ -246,6 +246,7 @@ def test_override_error_names_the_override_instead_of_a_line():
         ("output.path=../run.h5", "--out names the directory"),
         ("output.fields=[speed]", "must be one of position, velocity"),
         ("checkpoint.keep=0", "must be >= 1"),
+        ("contact.scip={form: contact, linear: cg}", "cg solves for velocities of bodies"),
         ("contact.solver=apdg", "must be one of apgd, scip, auto. Did you mean 'apgd'?"),
         ("contact.warm_start=yes", "must be true or false, not text"),
         ("contact.recovery_speed=0", "must be > 0 [m/s]"),
@@ -557,6 +558,29 @@ def _mutated_data(data: object, draw: random.Random) -> str:
     values = [None, True, -1, 0, 1e30, 1e-30, -1e30, 10**18, "", "glass", [], {}, [1, 2, 3]]
     node[key] = draw.choice([*values, [[]], {"min": 1}, {"x": None}, [None] * 3, 3.5, 2**53])
     return json.dumps(data)
+
+
+@pytest.mark.parametrize(
+    ("axis", "rule"),
+    [
+        ("[1, 2, true]", "axis[2] = true: must be a number"),
+        ("randm", "axis = \"randm\": must be random. Did you mean 'random'?"),
+        ("3", "axis = 3: must be a list"),
+        ("[1, 2]", "axis = [1, 2]: must be a list of more than 2 items"),
+    ],
+)
+def test_bad_word_or_list_is_refused_as_what_it_was_meant_to_be(axis: str, rule: str):
+    rods = "{shape: spherocylinder, aspect_ratio: 2, axis: %s, material: glass, count: 1, radius: 1"
+    placement = "placement: {random: {min: [-5, -5, -5], max: [5, 5, 5]}}}"
+    text = f"""
+domain: {{min: [-9, -9, -9], max: [9, 9, 9]}}
+materials: {{glass: {{density: 1}}}}
+bodies: [{rods % axis}, {placement}]
+time: {{step: 1, end: 1}}
+"""
+    with pytest.raises(InputError) as caught:
+        parse_scenario(text, "scene.yaml")
+    assert rule in str(caught.value)
 
 
 @pytest.mark.parametrize("seed", range(10))
