@@ -148,7 +148,7 @@ def solve_file(
         for line in _problem_lines(problem, operator.description, cone, options):
             say(line)
         report = solver.solve(cone, _guess(problem, options.guess))
-        for line in _report_lines(report, cone, options.law, prepared):
+        for line in _report_lines(report, cone, options.solver, options.law, prepared):
             say(line)
         if not operator.symmetric:
             say(_asymmetry_line(problem.form, operator.asymmetry))
@@ -272,12 +272,16 @@ def _problem_lines(
     ]
 
 
-def _report_lines(report: SolveReport, cone: ConeProblem, law: Law, prepared: float) -> list[str]:
-    """Collective. What the solve did, and the residuals of the law it was made for."""
+def _report_lines(
+    report: SolveReport, cone: ConeProblem, solver: str, law: Law, prepared: float
+) -> list[str]:
+    """Collective. What the solver asked for did, and the residuals of the law it was made for."""
     r = report.residuals
     v, gamma = cone.velocity_scale, cone.impulse_scale
     outcome = "converged" if report.converged else f"NOT CONVERGED: {report.reason}"
-    kind = "Newton iterations" if report.solver == "scip" else "iterations"
+    kind = {"apgd": "iterations", "scip": "Newton iterations"}.get(
+        solver, f"iterations, {report.factorisations} of them Newton's,"
+    )
     rounds = f" in {report.outer} cone problems" if law == "coulomb" else ""
     lines = [
         f"{outcome}: {report.iterations} {kind}{rounds}, {report.products} products with W, "
