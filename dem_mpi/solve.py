@@ -280,7 +280,7 @@ def _report_lines(
     v, gamma = cone.velocity_scale, cone.impulse_scale
     outcome = "converged" if report.converged else f"NOT CONVERGED: {report.reason}"
     kind = {"apgd": "iterations", "scip": "Newton iterations"}.get(
-        solver, f"iterations, {report.factorisations} of them Newton's,"
+        solver, f"iterations, {report.factorisations} of them Newton's"
     )
     rounds = f" in {report.outer} cone problems" if law == "coulomb" else ""
     lines = [
