@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -154,7 +154,12 @@ class Trial:
         return simulation
 
     def run(self, simulation: Simulation, steps: int) -> Iterator[StepRecord]:
-        """Collective. Step, hold every step against what all of them must keep, and yield it."""
+        """Collective. Step, hold every step against what all of them must keep, and yield it.
+
+        The scales v_ref and gamma_ref are those of the first step where a later one has larger:
+        a solver that sends bodies flying must not widen its own limits.
+        """
+        first: StepRecord | None = None
         for _ in range(steps):
             before = _momentum(simulation)
             record = simulation.step()
@@ -162,7 +167,9 @@ class Trial:
                 record.iterations, record.products, record.r_d, record.converged, record.reason
             )
             self._balance(simulation, record, before)
-            yield record
+            first = first or record
+            v_ref = min(record.v_ref, first.v_ref)
+            yield replace(record, v_ref=v_ref, gamma_ref=min(record.gamma_ref, first.gamma_ref))
 
     def advance(self, simulation: Simulation, steps: int) -> Bodies:
         """Collective. Step, and return all bodies in the order of gid."""
@@ -315,13 +322,18 @@ def attempt(name: str, solver: str, parallel: Parallel | None = None) -> Trial:
     return trial
 
 
-# An impulse p of 10^6 gamma_ref leaves rounding errors eps p/m in g, so eps p^2/m in p g: that is
-# 10^12 eps = 2e-4 of v_ref gamma_ref, and no solver can be asked for less. (A fifty times larger
-# limit still leaves no more than g_n = 1e-8 v_ref in the contact that carries p.)
+# gamma_ref is that of the median contact. Where the median is light, an impulse p of 10^6 gamma_ref
+# leaves rounding errors eps p/m in g, so eps p^2/m in p g: 10^12 eps = 2e-4 of v_ref gamma_ref, and
+# no solver can be asked for less. (A fifty times larger limit still leaves no more than 1e-8 v_ref
+# in the contact that carries p.) Where it is heavy, 1e-8 would let the light body, which carries
+# 1e-6 gamma_ref, leave at 1e-2 v_ref.
 MASS_RATIO_WORK = 1e-2
+MEDIAN_HEAVY_WORK = 1e-13
 
 
-def stack(trial: Trial, material: Sequence[int], steps: int, speed: float = 0.0) -> None:
+def stack(
+    trial: Trial, material: Sequence[int], steps: int, speed: float = 0.0, work: float = WORK
+) -> None:
     """Equal spheres on one another on a floor, falling as one at `speed` [m/s]: all of it stops.
 
     A gap is within h max(r_d, r_c/p) of zero, so a speed within twice the sum of those of the
@@ -331,14 +343,14 @@ def stack(trial: Trial, material: Sequence[int], steps: int, speed: float = 0.0)
     position = [[0.0, 0.0, R * (1 + 2 * k)] for k in range(count)]
     simulation = trial.simulation(
         position, material=material, velocity=[0.0, 0.0, -speed], mu=0.3, walls=[FLOOR],
-        contact={"complementarity": MASS_RATIO_WORK},
+        contact={"complementarity": work},
     )  # fmt: skip
     left = np.zeros(count)
     for k, record in enumerate(trial.run(simulation, steps)):
         bodies = trial.bodies(simulation)
         push = G * H + (speed if k == 0 else 0.0)
         impulse = np.cumsum(bodies.mass[::-1])[::-1] * push
-        left = np.maximum(left, separation_limit(record, impulse, MASS_RATIO_WORK))
+        left = np.maximum(left, separation_limit(record, impulse, work))
         slow = 2 * np.cumsum(left)
         gaps = np.diff(bodies.position[:, 2], prepend=-R) - 2 * R
         trial.check("gap", np.abs(gaps).max(), H * left.max(), "m", "h max(r_d, r_c/p)")
@@ -365,15 +377,15 @@ def separation_limit(record: StepRecord, impulse: ArrayLike, work: float = WORK)
 @case("heavy on light")
 def heavy_on_light(trial: Trial) -> None:
     """A sphere bears one of 10^6 times its mass: at rest, and landing at 1 m/s."""
-    stack(trial, [0, 1], steps=10)
-    stack(trial, [0, 1], steps=10, speed=1.0)
+    stack(trial, [0, 1], steps=10, work=MASS_RATIO_WORK)
+    stack(trial, [0, 1], steps=10, speed=1.0, work=MASS_RATIO_WORK)
 
 
 @case("light on heavy")
 def light_on_heavy(trial: Trial) -> None:
     """A sphere lies on one of 10^6 times its mass; and a stack of light, heavy, light, heavy."""
-    stack(trial, [1, 0], steps=10)
-    stack(trial, [0, 1, 0, 1], steps=10)
+    stack(trial, [1, 0], steps=10, work=MEDIAN_HEAVY_WORK)
+    stack(trial, [0, 1, 0, 1], steps=10, work=MASS_RATIO_WORK)
 
 
 COLUMN = 1000
@@ -455,13 +467,11 @@ def slide(trial: Trial, names: Sequence[str], steps: int = 100) -> None:
         found = bodies.velocity[:, 0] + np.where(rolls, 0.0, mu * bodies.velocity[:, 2])
         # Without friction a residual in g_n does not touch v_x.
         limit = np.where(mu > 0.0, left / np.where(mu > 0.0, mu, 1.0), 0.0) + ROUND_OFF * G * t
-        worst = int(np.argmax(np.abs(found - speed) / limit))
-        trial.check(
-            f"speed down the slope, mu = {mu[worst]:g}", abs(found - speed)[worst], limit[worst],
-            "m/s", "max(r_d, r_c/p) / mu of slip a step",
-        )  # fmt: skip
-        if not mu.any():
-            break
+        for one, error, most in zip(mu, np.abs(found - speed), limit, strict=True):
+            trial.check(
+                f"speed down the slope, mu = {one:g}", error, most, "m/s",
+                "max(r_d, r_c/p) / mu of slip a step",
+            )  # fmt: skip
     smooth = mu == 0.0
     trial.check(
         "spin without friction", np.abs(bodies.angular_velocity[smooth]).max(initial=0.0), 0.0,
