@@ -101,11 +101,13 @@ class Scip(Model):
         "1", "Newton iterations per cone problem at most", default=60, ge=1
     )
     form: Literal["auto", "velocity", "contact"] = note(
-        "Unknowns of the Newton systems; auto: those whose factor is estimated to be smaller",
+        "Unknowns of the Newton systems: velocities of bodies, smaller in dense beds, or impulses "
+        "of contacts, smaller in loose ones; auto: by their counts",
         default="auto",
     )
     linear: Literal["mumps", "cg"] = note(
-        "Newton systems by Cholesky factors, or by conjugate gradients", default="mumps"
+        "Newton systems by factors of MUMPS, or in less memory by conjugate gradients",
+        default="mumps",
     )
     preconditioner: Literal["icc", "block_jacobi", "low_rank"] = note(
         "Of conjugate gradients: incomplete Cholesky factors, one a rank; the 6 x 6 blocks of the "
@@ -113,13 +115,21 @@ class Scip(Model):
         default="icc",
     )
     ordering: Literal["auto", "amd", "metis", "scotch", "pord"] = note(
-        "Fill-reducing ordering of the factorisation", default="auto"
+        "Order of elimination, which memory and time of a factorisation depend on; auto: MUMPS's "
+        "choice",
+        default="auto",
     )
     workspace: Whole = quantity(
-        "1", "Extra working space of the factorisation in percent of its estimate", default=35, ge=1
+        "1",
+        "Extra working space of a factorisation, in percent of MUMPS's estimate",
+        default=35,
+        ge=1,
     )
     memory: Positive | None = quantity(
-        "MB", "Memory a rank may use for factors at most; null: no limit", default=None
+        "MB",
+        "Memory a rank may use for factors: scip ends with a message where it needs more, auto "
+        "goes on with gradients; null: no limit, for auto what the machine has",
+        default=None,
     )
 
     @field_validator("linear")
@@ -134,13 +144,14 @@ class Contact(Model):
     """The contact solve of each step and its tolerance."""
 
     solver: Literal["apgd", "scip", "auto"] = note(
-        "Method for the cone complementarity problem: apgd, first order, cheap iterations; scip, "
-        "interior point, tight tolerances; auto: apgd first, scip where that promises less work",
+        "Method for the contact problem of a step. apgd: gradients, many cheap iterations, any "
+        "size; scip: interior point, few iterations with a sparse factorisation each, for tight "
+        "tolerances; auto: apgd, then scip where counts promise less work",
         default="apgd",
     )
     law: Literal["ccp", "coulomb"] = note(
-        "ccp: one convex problem a step, sliding contacts open by h mu |v_t|; coulomb: Coulomb's "
-        "law itself, several such problems a step",
+        "Law of friction. ccp: convex, contacts that slide hover at a gap of h mu |v_t|; coulomb: "
+        "they stay closed, for several such problems a step; not for tight tolerances in beds",
         default="ccp",
     )
     tolerance: Positive = quantity(
@@ -161,7 +172,7 @@ class Contact(Model):
         default="absolute",
     )
     max_iterations: Whole = quantity(
-        "1", "Iterations of apgd per cone problem at most", default=5000, ge=1
+        "1", "Iterations of apgd per cone problem at most, under auto too", default=5000, ge=1
     )
     scip: Scip = note("Interior point method", default=Scip())
     warm_start: Switch = note("Start from the impulses of the last step", default=True)
