@@ -197,7 +197,7 @@ class SolverCounts:
         gradients = self._iterations - self._factorisations
         parts = [f"solved by {by}", f"{gradients:,} gradient iterations"]
         if self._factorisations:
-            parts.append(f"{self._factorisations:,} Newton iterations, each with a factorisation")
+            parts.append(f"{self._factorisations:,} Newton iterations")
         if self._outer > steps:
             parts.append(f"{self._outer:,} cone problems")
         return ["; ".join(parts)]

@@ -598,14 +598,17 @@ class Simulation:
         low, high = self._worst_contact(substep.contacts, violation)
         raise SolverFailureError(
             f"step {step}: {why}: r_d = {residuals.dual:.3g} m/s, worst at the contact of body "
-            f"{low} with {self._name(high)}. {self._remedy()}, lower time.step, or set "
+            f"{low} with {self._name(high)}. {self._remedy(report)}, lower time.step, or set "
             f"contact.on_failure: shrink_step"
         )
 
-    def _remedy(self) -> str:
-        if self.scenario.contact.solver == "apgd":
+    def _remedy(self, report: SolveReport) -> str:
+        contact = self.scenario.contact
+        if report.outer == 1 and contact.solver == "apgd":
             return "Raise contact.max_iterations, set contact.solver: auto"
-        return "Raise contact.scip.max_iterations"
+        if report.outer == 1 and report.factorisations >= contact.scip.max_iterations:
+            return "Raise contact.scip.max_iterations"
+        return "Loosen contact.tolerance and contact.complementarity"
 
     def _worst_contact(self, contacts: ContactSet, measure: NDArray) -> tuple[int, int]:
         """Collective. The gids of the contact with the largest, or an undefined, measure (m,)."""
