@@ -288,17 +288,17 @@ def gradient_step(gamma, gamma_old, g, g_old, beta, step, s, mu, gamma_new, d, p
 
 
 @jit_threads
-def curvature(g, g_old, beta, d, b, gamma_new, g_new, mu, partial):
-    """g_new = g(y) + N d; returns (d.N d, objective, max r_d, max |gamma.g|) of gamma_new.
+def curvature(g, g_old, beta, d, b, gamma_new, g_new, mu, weight, partial):
+    """g_new = g(y) + N d; returns d.N d, and of gamma_new objective, r_d and weighted |gamma.g|.
 
-    g_new : (m, columns) holds N d on entry.
+    g_new : (m, columns) holds N d on entry; weight : (m,), of contacts in the last.
     r_d = max(0, mu |g_t| - g_n) [m/s]; objective = gamma.(g + b)/2.
     partial : (chunks, 4) scratch.
     """
     m, rows = g.shape
     chunks = partial.shape[0]
     for chunk in prange(chunks):
-        bend = objective = dual = complementarity = 0.0
+        bend = objective = dual = weighted = 0.0
         for i in range(chunk * CHUNK, min(m, (chunk + 1) * CHUNK)):
             bend += d[i, 0] * g_new[i, 0]
             gn = g[i, 0] + beta * (g[i, 0] - g_old[i, 0]) + g_new[i, 0]
@@ -318,27 +318,28 @@ def curvature(g, g_old, beta, d, b, gamma_new, g_new, mu, partial):
                 slip = mu[i] * np.sqrt(g1 * g1 + g2 * g2)
             objective += 0.5 * (work + push)
             dual = _larger(dual, slip - gn)
-            complementarity = _larger(complementarity, abs(work))
+            weighted = _larger(weighted, weight[i] * abs(work))
         partial[chunk, 0] = bend
         partial[chunk, 1] = objective
         partial[chunk, 2] = dual
-        partial[chunk, 3] = complementarity
-    bend = objective = dual = complementarity = 0.0
+        partial[chunk, 3] = weighted
+    bend = objective = dual = weighted = 0.0
     for chunk in range(chunks):
         bend += partial[chunk, 0]
         objective += partial[chunk, 1]
         dual = _larger(dual, partial[chunk, 2])
-        complementarity = _larger(complementarity, partial[chunk, 3])
-    return bend, objective, dual, complementarity
+        weighted = _larger(weighted, partial[chunk, 3])
+    return bend, objective, dual, weighted
 
 
 @jit
-def residuals(gamma, g, b, mu):
+def residuals(gamma, g, b, mu, weight):
     """Return maxima and sums that every solver is judged by.
 
-    (r_p [N s], r_d [m/s], r_c [J], objective [J], D's r_d (mu > 0), D's sum of gamma.g).
+    (r_p [N s], r_d [m/s], r_c [J], the same weighted by contacts [J], objective [J],
+    D's r_d (mu > 0), D's sum of gamma.g).
     """
-    primal = dual = complementarity = objective = thesis_dual = thesis_sum = 0.0
+    primal = dual = complementarity = weighted = objective = thesis_dual = thesis_sum = 0.0
     rows = gamma.shape[1]
     for i in range(gamma.shape[0]):
         zn, gn = gamma[i, 0], g[i, 0]
@@ -353,11 +354,12 @@ def residuals(gamma, g, b, mu):
         primal = _larger(primal, _larger(t - mu[i] * zn, -zn))
         dual = _larger(dual, mu[i] * slip - gn)
         complementarity = _larger(complementarity, abs(work))
+        weighted = _larger(weighted, weight[i] * abs(work))
         if mu[i] > 0.0:
             thesis_dual = _larger(thesis_dual, slip - gn / mu[i])
         thesis_sum += work
         objective += 0.5 * (work + push)
-    return primal, dual, complementarity, objective, thesis_dual, thesis_sum
+    return primal, dual, complementarity, weighted, objective, thesis_dual, thesis_sum
 
 
 @jit

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal, Protocol
 
 import numpy as np
@@ -54,6 +55,18 @@ class ConeProblem:
         """Number of contacts on this rank."""
         return self.b.shape[0]
 
+    @cached_property
+    def weight(self) -> NDArray:
+        """max(1, N_ii gamma_ref/v_ref), (m,): how much lighter than the median a contact is.
+
+        gamma.g counts that many times where a solve may stop. A light body among heavy ones would
+        otherwise be thrown off by an error that is small beside their impulses.
+        """
+        if not self.velocity_scale > 0.0:
+            return np.ones(self.contacts)
+        stiffness = self.operator.diagonal().max(axis=1, initial=0.0)
+        return np.maximum(1.0, stiffness * (self.impulse_scale / self.velocity_scale))
+
 
 @dataclass(frozen=True)
 class Residuals:
@@ -62,6 +75,7 @@ class Residuals:
     primal          max_i max(0, |gamma_t| - mu gamma_n)        [N s]
     dual            max_i max(0, mu |g_t| - g_n)                [m/s]; h dual is added overlap [m]
     complementarity max_i |gamma_i . g_i|                       [J]
+    weighted_work   the same, light contacts weighted as in `ConeProblem.weight`  [J]
     objective       gamma.N gamma/2 + b.gamma                   [J]
     thesis          max of S. De's 2.35-2.37, contacts with mu > 0 only (mixed units)
     """
@@ -69,6 +83,7 @@ class Residuals:
     primal: float
     dual: float
     complementarity: float
+    weighted_work: float
     objective: float
     thesis: float
 
@@ -82,8 +97,8 @@ class Residuals:
 class Tolerance:
     """When a solve may stop.
 
-    absolute  dual <= value [m/s] and complementarity <= relative_work v_ref gamma_ref [J]
-    scaled    dual <= value v_ref and the same complementarity
+    absolute  dual <= value [m/s] and weighted work <= relative_work v_ref gamma_ref [J]
+    scaled    dual <= value v_ref and the same for the work
     thesis    max(r_p, r_d, r_c) <= value with S. De's definitions (2.35-2.37)
     """
 
@@ -95,13 +110,13 @@ class Tolerance:
         """Return the largest residual over its limit: the problem is solved when this is <= 1."""
         if self.kind == "thesis":
             return residuals.thesis / self.value
-        return self.merit_of(residuals.dual, residuals.complementarity, problem)
+        return self.merit_of(residuals.dual, residuals.weighted_work, problem)
 
-    def merit_of(self, dual: float, complementarity: float, problem: ConeProblem) -> float:
+    def merit_of(self, dual: float, weighted_work: float, problem: ConeProblem) -> float:
         """Return the merit of a cone-feasible impulse from its two residuals."""
         limit = self.value * (problem.velocity_scale if self.kind == "scaled" else 1.0)
         work = self.relative_work * problem.velocity_scale * problem.impulse_scale
-        return max(dual / limit, complementarity / work if work > 0.0 else 0.0)
+        return max(dual / limit, weighted_work / work if work > 0.0 else 0.0)
 
 
 def evaluate(problem: ConeProblem, impulse: NDArray, velocity: NDArray) -> Residuals:
@@ -109,10 +124,10 @@ def evaluate(problem: ConeProblem, impulse: NDArray, velocity: NDArray) -> Resid
 
     Where a value on any rank is not a number the largest violations are infinite, on all ranks.
     """
-    primal, dual, work, objective, thesis_dual, thesis_sum = kernels.residuals(
-        impulse, velocity, problem.b, problem.mu
+    primal, dual, work, weighted, objective, thesis_dual, thesis_sum = kernels.residuals(
+        impulse, velocity, problem.b, problem.mu, problem.weight
     )
-    largest = np.array([primal, dual, work, thesis_dual])
+    largest = np.array([primal, dual, work, weighted, thesis_dual])
     total = np.array([objective, thesis_sum, float(problem.contacts)])
     largest_of_ranks(largest, problem.parallel)
     problem.parallel.sum_in_place(total)
@@ -121,8 +136,9 @@ def evaluate(problem: ConeProblem, impulse: NDArray, velocity: NDArray) -> Resid
         primal=float(largest[0]),
         dual=float(largest[1]),
         complementarity=float(largest[2]),
+        weighted_work=float(largest[3]),
         objective=float(total[0]),
-        thesis=float(max(largest[0], largest[3], thesis_work)),
+        thesis=float(max(largest[0], largest[4], thesis_work)),
     )
 
 

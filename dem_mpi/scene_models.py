@@ -163,7 +163,8 @@ class Contact(Model):
     complementarity: Positive = quantity(
         "1",
         "Largest |impulse . velocity| of a contact at which a solve may stop, as a fraction of"
-        " v_ref gamma_ref; unused by tolerance_kind thesis",
+        " v_ref gamma_ref (for a contact lighter than most, of its own gamma_ref); unused by"
+        " tolerance_kind thesis",
         default=1e-4,
     )
     tolerance_kind: Literal["absolute", "scaled", "thesis"] = note(

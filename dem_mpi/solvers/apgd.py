@@ -94,7 +94,7 @@ class Apgd:
         first = evaluate(problem, gamma, g)
         merit = tolerance.merit(first, problem)
         best, best_merit = gamma.copy(), merit
-        history: list[tuple[float, ...]] = [(0, first.dual, first.complementarity, first.objective)]
+        history: list[tuple[float, ...]] = [(0, first.dual, first.weighted_work, first.objective)]
         iteration = 0
         reason = "reached the iteration limit"
         fixed = options.fixed_iterations
@@ -111,8 +111,9 @@ class Apgd:
                 problem.operator.apply(d, g_new)
                 products += 1
                 sums[2], sums[3], dual, work = bend_kernel(
-                    g, g_old, beta, d, problem.b, gamma_new, g_new, problem.mu, partial4
-                )
+                    g, g_old, beta, d, problem.b, gamma_new, g_new, problem.mu, problem.weight,
+                    partial4,
+                )  # fmt: skip
                 parallel.sum_in_place(sums)
                 square, uphill, bend, objective = sums
                 if bend <= L * square or not math.isfinite(bend):

@@ -300,7 +300,7 @@ class _Totals:
         self.linear_residual = max(self.linear_residual, report.linear_residual)
         self.seconds.update(report.seconds)
         self.history.append(
-            (self.iterations, residuals.dual, residuals.complementarity, residuals.objective)
+            (self.iterations, residuals.dual, residuals.weighted_work, residuals.objective)
         )
 
     def report(self, best: _Iterate, reason: str, lipschitz: float) -> SolveReport:

@@ -17,7 +17,7 @@ class SolveReport:
 
     impulse  : (m, columns) [N s], inside the cones
     velocity : (m, columns) [m/s], g = N impulse + b from a fresh product
-    history  : (k, 4) iteration, dual residual [m/s], complementarity [J], objective [J]
+    history  : (k, 4) iteration, dual residual [m/s], weighted work [J], objective [J]
     lipschitz: last step-size constant of APGD, a starting value for the next problem of its kind
     solver   : the method that made the impulse, "apgd" or "scip"
     outer    : cone problems solved in turn; more than one only under Coulomb's law

@@ -221,7 +221,7 @@ def test_not_a_number_on_one_rank_is_seen_by_all(parallel, where):
 def test_residuals_of_no_contacts_are_zero():
     problem = part(Parallel.alone(), np.zeros((0, 0)), np.zeros((0, 3)), np.zeros(0))
     found = evaluate(problem, np.zeros((0, 3)), np.zeros((0, 3)))
-    assert found == Residuals(0.0, 0.0, 0.0, 0.0, 0.0)
+    assert found == Residuals(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     assert found.finite
 
 
@@ -232,7 +232,9 @@ def test_tolerance_kinds_compare_with_their_own_scales():
     problem = ConeProblem(
         DenseDelassus(np.eye(3), 3), np.zeros((1, 3)), np.ones(1), 0.5, 0.2, Parallel.alone()
     )
-    found = Residuals(0.0, dual=2e-3, complementarity=3e-3, objective=-1.0, thesis=7e-3)
+    found = Residuals(
+        0.0, dual=2e-3, complementarity=1e-9, weighted_work=3e-3, objective=-1.0, thesis=7e-3
+    )
     work = 1e-2 * 0.5 * 0.2
     absolute = Tolerance(1e-3, "absolute", 1e-2)
     assert absolute.merit(found, problem) == pytest.approx(max(2e-3 / 1e-3, 3e-3 / work))
@@ -241,11 +243,25 @@ def test_tolerance_kinds_compare_with_their_own_scales():
     assert Tolerance(1e-2, "thesis").merit(found, problem) == pytest.approx(0.7)
 
 
+def test_work_of_a_light_contact_counts_by_its_own_impulses():
+    """Of three contacts with N_ii = 1, 2, 1e6 1/kg the last has a gamma_ref of its own."""
+    N = np.diag([1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 1e6, 1e6, 1e6])
+    alone = Parallel.alone()
+    problem = ConeProblem(DenseDelassus(N, 3), np.zeros((3, 3)), np.ones(3), 4.0, 2.0, alone)
+    assert problem.weight == pytest.approx([1.0, 1.0, 5e5])
+    impulse, velocity = np.zeros((3, 3)), np.zeros((3, 3))
+    impulse[:, 0], velocity[:, 0] = [1.0, 1.0, 1e-6], [0.1, 0.2, 3.0]
+    found = evaluate(problem, impulse, velocity)
+    assert (found.complementarity, found.weighted_work) == pytest.approx((0.2, 1.5))
+
+
 def test_tolerance_without_a_velocity_scale_asks_for_the_dual_alone():
     problem = ConeProblem(
         DenseDelassus(np.eye(3), 3), np.zeros((1, 3)), np.ones(1), 0.0, 0.0, Parallel.alone()
     )
-    found = Residuals(0.0, dual=5e-5, complementarity=1.0, objective=0.0, thesis=0.0)
+    found = Residuals(
+        0.0, dual=5e-5, complementarity=1.0, weighted_work=1.0, objective=0.0, thesis=0.0
+    )
     assert Tolerance(1e-4).merit(found, problem) == 0.5
 
 

@@ -299,7 +299,7 @@ def test_limit_of_outer_iterations_leaves_the_best_iterate_and_says_so():
     assert not report.converged
     assert report.reason == "reached the limit of outer iterations"
     assert report.outer == 3
-    assert report.residuals.complementarity == report.history[:, 2].min()
+    assert report.residuals.weighted_work == report.history[:, 2].min()
     again = law_residuals(problem, report.impulse, report.velocity)
     assert again == report.residuals
 

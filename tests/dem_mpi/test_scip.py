@@ -515,7 +515,7 @@ def test_failing_linear_algebra_leaves_the_best_iterate_and_a_reason(how, at):
     )
     kept = max(
         report.residuals.dual / problem.velocity_scale,
-        report.residuals.complementarity / (problem.velocity_scale * problem.impulse_scale),
+        report.residuals.weighted_work / (problem.velocity_scale * problem.impulse_scale),
     )
     assert kept == pytest.approx(np.nanmin(merits), rel=1e-9)
 
