@@ -11,6 +11,7 @@ J = diag(1, -1, -1). W = eta [w_n, w_t^T; w_t, 1 + w_t w_t^T/(1 + w_n)] with det
 scaling of Nesterov and Todd, lambda = W x = W^-1 y the scaled point; P = W^2 = eta^2 (2 w w^T - J).
 A direction is (u, v) = (W dx, W^-1 dy) in the scaled space and fulfils u + v = c - lambda, where
 lambda o c is what x o y shall become, to first order; z = lambda \ a solves lambda o z = a.
+The last four loops serve Newton's method on the natural map, see `solvers/semismooth.py`.
 Sums run over chunks of fixed length, so the number of threads changes no bit.
 """
 
@@ -19,7 +20,7 @@ from __future__ import annotations
 import numpy as np
 
 from dem_mpi._jit import jit, jit_threads, prange
-from dem_mpi._kernels_solver import CHUNK
+from dem_mpi._kernels_solver import CHUNK, _project
 
 
 @jit
@@ -236,6 +237,47 @@ def blocks(eta, w, mu, Q, R, root):
 
 
 @jit_threads
+def soften(soft, mu, Q, R, root):
+    """R += soft, Q = (R + soft)^-1 and its root, in place; tangents of mu = 0 stay as they are.
+
+    With Q = L L^T and C C^T = 1 + soft L^T L the new root is L C^-T: nothing large is inverted.
+    soft : (m,) [1/kg].
+    """
+    columns = root.shape[1]
+    for i in prange(root.shape[0]):
+        a = soft[i]
+        R[i, 0, 0] += a
+        if columns == 1:
+            root[i, 0, 0] /= np.sqrt(1.0 + a * root[i, 0, 0] * root[i, 0, 0])
+            Q[i, 0, 0] = root[i, 0, 0] * root[i, 0, 0]
+            continue
+        if mu[i] > 0.0:
+            R[i, 1, 1] += a
+            R[i, 2, 2] += a
+        C = np.zeros((3, 3))
+        for j in range(3):
+            for k in range(j + 1):
+                total = 1.0 if j == k else 0.0
+                for r in range(3):
+                    total += a * root[i, r, j] * root[i, r, k]
+                for r in range(k):
+                    total -= C[j, r] * C[k, r]
+                C[j, k] = np.sqrt(total) if j == k else total / C[k, k]
+        for r in range(3):
+            for j in range(3):
+                total = root[i, r, j]
+                for k in range(j):
+                    total -= root[i, r, k] * C[j, k]
+                root[i, r, j] = total / C[j, j]
+        for r in range(3):
+            for j in range(3):
+                total = 0.0
+                for k in range(3):
+                    total += root[i, r, k] * root[i, j, k]
+                Q[i, r, j] = total
+
+
+@jit_threads
 def right_side(g, eta, w, mu, c, s):
     """s = T (W (c - lambda) - (T^-1 g - y)) = T W c - g, without tangents where mu = 0."""
     for i in prange(g.shape[0]):
@@ -394,3 +436,100 @@ def advance(x, y, dgamma, dg, g, mu, step_x, step_y):
         yn, y1, y2 = _row(y, i)
         n, t1, t2 = _row_of_dy(g, dg, y, f, i)
         _put(y, i, yn + step_y * n, y1 + step_y * t1, y2 + step_y * t2)
+
+
+@jit_threads
+def decompose(gamma, g, mu, unit, p, y):
+    """gamma - g/unit = p - y/unit with p in the cone, y in its dual, p.y = 0 (J.-J. Moreau).
+
+    Exactly, y = 0 where the contact sticks and p = 0 where it opens. unit : (m,) [1/kg].
+    """
+    for i in prange(gamma.shape[0]):
+        n, t1, t2 = _row(gamma, i)
+        gn, g1, g2 = _row(g, i)
+        n -= gn / unit[i]
+        t1 -= g1 / unit[i]
+        t2 -= g2 / unit[i]
+        if mu[i] == 0.0:
+            t1 = t2 = 0.0
+        pn, p1, p2 = _project(n, t1, t2, mu[i])
+        _put(p, i, pn, p1, p2)
+        _put(y, i, unit[i] * (pn - n), unit[i] * (p1 - t1), unit[i] * (p2 - t2))
+
+
+@jit_threads
+def mismatch(y, g, mu, s, partial):
+    """s = y - g, without tangents where mu = 0; returns max |s|. partial : (chunks,) scratch."""
+    m = y.shape[0]
+    chunks = partial.shape[0]
+    for chunk in prange(chunks):
+        worst = 0.0
+        for i in range(chunk * CHUNK, min(m, (chunk + 1) * CHUNK)):
+            yn, y1, y2 = _row(y, i)
+            gn, g1, g2 = _row(g, i)
+            n, t1, t2 = yn - gn, y1 - g1, y2 - g2
+            if mu[i] == 0.0:
+                t1 = t2 = 0.0
+            _put(s, i, n, t1, t2)
+            worst = _larger(worst, np.sqrt(n * n + t1 * t1 + t2 * t2))
+        partial[chunk] = worst
+    worst = 0.0
+    for chunk in range(chunks):
+        worst = _larger(worst, partial[chunk])
+    return worst
+
+
+@jit
+def _add_direction(i, r, e, Q, R):
+    """R += r e e^T and Q += e e^T / r."""
+    for a in range(3):
+        for b in range(3):
+            R[i, a, b] += r * e[a] * e[b]
+            Q[i, a, b] += e[a] * e[b] / r
+
+
+@jit_threads
+def slopes(p, y, mu, unit, soft, stiff, Q, R, root):
+    """R with dy = -R dp for the pairs (p, y) of `decompose`, Q = R^-1 and its root, (m, c, c).
+
+    A sticking contact has R = 0, one that opens R infinite. One that slides may change its impulse
+    along the edge of the cone (R = 0), turns it at |y_t|/|p_t|, and cannot leave the edge.
+    All are kept between soft and stiff times unit. Tangents of mu = 0 get zeros.
+    """
+    columns = p.shape[1]
+    for i in prange(p.shape[0]):
+        low, high = soft * unit[i], stiff * unit[i]
+        _, p1, p2 = _row(p, i)
+        yn, y1, y2 = _row(y, i)
+        sticks = yn == 0.0 and y1 == 0.0 and y2 == 0.0
+        if columns == 1:
+            R[i, 0, 0] = low if sticks else high
+            Q[i, 0, 0] = 1.0 / R[i, 0, 0]
+            root[i, 0, 0] = np.sqrt(Q[i, 0, 0])
+            continue
+        for a in range(3):
+            for b in range(3):
+                Q[i, a, b] = R[i, a, b] = root[i, a, b] = 0.0
+        t = np.sqrt(p1 * p1 + p2 * p2)
+        if sticks or t == 0.0:
+            r = low if sticks else high
+            for a in range(3 if mu[i] > 0.0 else 1):
+                R[i, a, a] = r
+                Q[i, a, a] = 1.0 / r
+                root[i, a, a] = np.sqrt(1.0 / r)
+            continue
+        f = mu[i]
+        q = 1.0 / np.sqrt(1.0 + f * f)
+        c1, c2 = p1 / t, p2 / t
+        turn = np.sqrt(y1 * y1 + y2 * y2) / t
+        turn = min(turn + low, high)
+        edge = (q, q * f * c1, q * f * c2)
+        across = (q * f, -q * c1, -q * c2)
+        lateral = (0.0, -c2, c1)
+        _add_direction(i, low, edge, Q, R)
+        _add_direction(i, high, across, Q, R)
+        _add_direction(i, turn, lateral, Q, R)
+        for a in range(3):
+            root[i, a, 0] = edge[a] / np.sqrt(low)
+            root[i, a, 1] = across[a] / np.sqrt(high)
+            root[i, a, 2] = lateral[a] / np.sqrt(turn)

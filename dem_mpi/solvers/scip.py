@@ -10,6 +10,12 @@ and so gamma, is strictly inside its cone at every iterate. y is an unknown of i
 it from T^-1 (N gamma + b) falls by 1 - alpha with every step alpha. Without friction a cone is the
 half-line x_n >= 0, by the same formulas.
 
+Where N is singular the Newton system becomes so too: sticking contacts add R ~ target to it. A
+proximal term, |gamma - last gamma|^2, keeps N + R away from that without changing the solution
+(M. Friedlander, D. Orban, Math. Program. Comput. 4, 2012). Close to the end, below what tolerances
+of a simulation ask for, Newton's method on the natural map takes over if it converges: there the
+velocities of an interior point are off by the root of target (see `semismooth`).
+
 Symbols: lambda, W, u, v, c, s as in `_kernels_scip`; mu-hat, here `mean`, is x.y per contact.
 """
 
@@ -19,6 +25,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import count
 from time import perf_counter
 from typing import Any, Protocol
 
@@ -31,6 +38,7 @@ from dem_mpi.cone import ConeProblem, Residuals, Tolerance, evaluate, largest_of
 from dem_mpi.newton import LinearSolve, NewtonFailureError, NewtonOptions, NewtonSystem
 from dem_mpi.parallel import Parallel
 from dem_mpi.solvers.result import SolveReport
+from dem_mpi.solvers.semismooth import NaturalMap, Patience
 
 # The start lies on the central path where x.y is this times the mean squared violation over N_nn:
 # impulses of force chains are an order larger than those that stop single bodies.
@@ -45,11 +53,22 @@ _WORTHWHILE = 1.01  # a corrector that does not lengthen the step by this factor
 _MISFIT = 1e-3
 _REFINEMENTS = 4
 _LINEAR, _CORRECTION = 1e-9, 1e-3  # relative residuals asked of a solve, and of a refinement's
+_SOUND = 1e-8  # the relative residual above which a step on the natural map is not taken
 _POOR_STEP = 0.05  # below it the direction of plain centring is tried instead
 _TINY_STEP = 1e-4
 # Short steps, while this part of the first residual is left, tell that impulses are far larger than
 # those of the start: begin again, this much higher on the central path.
 _SHORT_STEP, _UNTOUCHED, _HIGHER, _RESTARTS = 0.2, 1e-3, 1e4, 4
+# The proximal term over N_nn. Larger ones keep more digits of the Newton systems in the
+# velocities, and make the way longer where impulses are not unique.
+_PROXIMAL = 1e-10
+# x.y of a contact over v_ref gamma_ref at which Newton's method is tried, and the part of it at
+# which it is tried again; the mismatch over v_ref up to which it is tried when all else has failed.
+_CLOSE, _CLOSER, _NEAR = 1e-11, 1e-3, 1e-4
+_HALF = 0.5  # that close, x.y falls at least by this from one iteration to the next, or it stalls
+# Where gamma.g is round-off, of impulses far above gamma_ref, a point is the better one if its
+# mismatch is this part of the other's, though gamma.g be larger by the second factor.
+_TENTH, _TENFOLD = 0.1, 10.0
 _NO_FURTHER = (
     "rounding lets it go no further, or bodies are jammed so that no finite impulse parts them"
 )
@@ -129,6 +148,8 @@ class Scip:
                 gamma[:] = 0.0
                 run.judge(gamma)
                 reason = self._attempt(run, gamma, cautious=False)
+            if not run.best_merit <= 1.0:
+                self._polish(run, quick=False)
         return run.report(reason, lipschitz, self._system, perf_counter() - started)
 
     def destroy(self) -> None:
@@ -157,6 +178,42 @@ class Scip:
         except NewtonFailureError as error:
             return str(error)
 
+    def _polish(self, run: _Run, quick: bool) -> None:
+        """Collective. Take Newton steps on the natural map from the best iterate so far.
+
+        quick : end with the first step that shows no convergence
+        """
+        system = self._system
+        if system is None or self.options.newton.linear == "cg":
+            return
+        newton, patience = NaturalMap(run.problem, run.best), Patience(quick)
+        run.products += 1
+        run.multiply(newton.impulse)
+        mismatch = first = least = newton.mismatch(run.g)
+        if not mismatch <= _NEAR:
+            return
+        while run.iterations < self.options.max_iterations and not patience.ends(
+            mismatch, newton.rounding
+        ):
+            run.iterations += 1
+            try:
+                run.factor(system, newton.blocks(mismatch))
+                residual = run.solve(system, newton.rest, newton.change, _LINEAR)
+            except NewtonFailureError:
+                return
+            if not residual <= _SOUND:
+                return
+            newton.advance()
+            run.linear_residual = max(run.linear_residual, residual)
+            run.products += 1
+            run.judge(newton.impulse)
+            mismatch = newton.mismatch(run.g)
+            if mismatch < least and mismatch <= _TENTH * first:
+                least = mismatch
+                run.prefer(newton.impulse, _TENFOLD)
+            if run.best_merit <= 1.0:
+                return
+
     def _follow(self, path: _CentralPath, run: _Run, gamma: NDArray, cautious: bool) -> str:
         """Collective. Iterate to the tolerance; return why it ended. `gamma` becomes the iterate.
 
@@ -168,8 +225,8 @@ class Scip:
         path.start(gamma, run.g)
         tiny, stalled, restarts = 0, 0, 0
         mean, residual, first = math.inf, math.inf, math.inf
-        most = self.options.max_iterations - run.iterations
-        for iteration in range(most + 1):
+        close = again = _CLOSE * run.problem.velocity_scale * run.problem.impulse_scale
+        for iteration in count():
             path.impulse(gamma)
             improved = run.judge(gamma)
             if run.best_merit <= 1.0:
@@ -177,11 +234,19 @@ class Scip:
             if not path.rescale(run.g):
                 return "not a number in the iteration, or rounding left the cones"
             falling = improved or path.mean < 0.9 * mean or path.residual < 0.9 * residual
+            if path.mean <= close:
+                falling = path.mean < _HALF * mean
             stalled = 0 if falling else stalled + 1
             mean, residual = min(mean, path.mean), min(residual, path.residual)
             if stalled >= _PATIENCE:
                 return f"stalled: residuals and complementarity fall no more; {_NO_FURTHER}"
-            if iteration == most:
+            if path.mean <= again:
+                again = _CLOSER * path.mean
+                self._polish(run, quick=True)
+                if run.best_merit <= 1.0:
+                    return "converged"
+                run.multiply(gamma)
+            if run.iterations >= self.options.max_iterations:
                 break
             run.iterations += 1
             step = path.advance(correctors)
@@ -210,6 +275,7 @@ class _Run:
         self.contacts = problem.parallel.sum(problem.contacts)
         self.g = np.empty_like(problem.b)
         self.best, self.best_merit = np.zeros_like(problem.b), math.inf
+        self.last_merit = math.inf
         self.history: list[tuple[float, ...]] = []
         self.iterations = self.products = self.factorisations = self.refinements = 0
         self.linear_residual = 0.0
@@ -229,20 +295,47 @@ class _Run:
         # The first row is the guess; the point that the path starts from gets none.
         if self.iterations >= len(self.history):
             self.history.append(
-                (self.iterations, residuals.dual, residuals.complementarity, residuals.objective)
+                (self.iterations, residuals.dual, residuals.weighted_work, residuals.objective)
             )
         merit = self.tolerance.merit(residuals, self.problem) if residuals.finite else math.inf
+        self.last_merit = merit
         better = merit < self.best_merit
         if better:
             self.best[:] = gamma
             self.best_merit = merit
         return better
 
-    def _evaluate(self, gamma: NDArray) -> Residuals:
+    def prefer(self, gamma: NDArray, factor: float) -> None:
+        """Take gamma, judged last, as the best if its merit is less than `factor` times the best's.
+
+        For those who know by another measure that it is; the merit to beat remains.
+        """
+        if self.last_merit < factor * self.best_merit:
+            self.best[:] = gamma
+
+    def multiply(self, gamma: NDArray) -> None:
+        """Collective. g = N gamma + b."""
         self.problem.operator.apply(gamma, self.g)
         self.g += self.problem.b
         self.products += 1
+
+    def _evaluate(self, gamma: NDArray) -> Residuals:
+        self.multiply(gamma)
         return evaluate(self.problem, gamma, self.g)
+
+    def factor(self, system: System, blocks: list[NDArray]) -> None:
+        """Collective. Factorise for the blocks Q, R and the root of Q."""
+        with self.timed("factor"):
+            system.factor(*blocks)
+            self.factorisations += 1
+
+    def solve(self, system: System, s: NDArray, out: NDArray, tolerance: float) -> float:
+        """Collective. out = (N + R)^-1 s; return its relative residual."""
+        with self.timed("substitute"):
+            done = system.solve(s, out, tolerance)
+        self.refinements += done.refinements
+        self.products += done.products
+        return done.residual
 
     def report(
         self, reason: str, lipschitz: float | None, system: System | None, seconds: float
@@ -296,6 +389,7 @@ class _CentralPath:
         chunks = max(1, math.ceil(m / CHUNK))
         self._partial = [np.zeros(chunks), np.zeros((chunks, 2)), np.zeros((chunks, 3))]
         self._g = run.g
+        self._soft = _PROXIMAL * problem.operator.diagonal()[:, 0]
         self.mean = self.residual = self.target = math.inf
 
     def start(self, gamma: NDArray, g: NDArray, target: float | None = None) -> None:
@@ -334,10 +428,10 @@ class _CentralPath:
     def advance(self, correctors: int) -> float:
         """Collective. Factorise, find a direction, step; return the step, NaN if there is none."""
         run, now = self._run, self._now
-        with run.timed("factor"):
-            self._kernel(kernels.blocks)(self._eta, self._w, self._problem.mu, *self._blocks)
-            self._system.factor(*self._blocks)
-            run.factorisations += 1
+        mu = self._problem.mu
+        self._kernel(kernels.blocks)(self._eta, self._w, mu, *self._blocks)
+        self._kernel(kernels.soften)(self._soft, mu, *self._blocks)
+        run.factor(self._system, self._blocks)
         now.c[:] = 0.0
         self._find(now)
         affine = min(1.0, now.longest)
@@ -400,8 +494,7 @@ class _CentralPath:
         d.residual = self._solve(d.dgamma, _LINEAR)
         last = math.inf
         for attempt in range(_REFINEMENTS + 1):
-            self._problem.operator.apply(d.dgamma, d.dg)
-            self._run.products += 1
+            self._multiply(d)
             primal, dual = kernel(kernels.direction)(
                 d.dgamma, d.dg, self._g, self._y, self._eta, self._w, self._lam, mu, d.u, d.v,
                 partial[1],
@@ -421,14 +514,16 @@ class _CentralPath:
             d.residual *= self._solve(self._correction, _CORRECTION)
             d.dgamma += self._correction
 
+    def _multiply(self, d: _Direction) -> None:
+        """Collective. dg = (N + proximal term) dgamma."""
+        self._problem.operator.apply(d.dgamma, d.dg)
+        self._run.products += 1
+        np.multiply(d.dgamma, self._soft[:, None], out=self._s)
+        d.dg += self._s
+
     def _solve(self, out: NDArray, tolerance: float) -> float:
         """Collective. out = (N + R)^-1 s; return its relative residual."""
-        run = self._run
-        with run.timed("substitute"):
-            done = self._system.solve(self._s, out, tolerance)
-        run.refinements += done.refinements
-        run.products += done.products
-        return done.residual
+        return self._run.solve(self._system, self._s, out, tolerance)
 
     def _kernel(self, kernel: Any) -> Callable:
         return kernel.using(self._problem.threads)
