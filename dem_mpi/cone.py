@@ -114,9 +114,13 @@ class Tolerance:
 
     def merit_of(self, dual: float, weighted_work: float, problem: ConeProblem) -> float:
         """Return the merit of a cone-feasible impulse from its two residuals."""
-        limit = self.value * (problem.velocity_scale if self.kind == "scaled" else 1.0)
-        work = self.relative_work * problem.velocity_scale * problem.impulse_scale
+        limit, work = self.limits(problem)
         return max(dual / limit, weighted_work / work if work > 0.0 else 0.0)
+
+    def limits(self, problem: ConeProblem) -> tuple[float, float]:
+        """Return the limits of dual [m/s] and weighted work [J], of the kinds but thesis."""
+        dual = self.value * (problem.velocity_scale if self.kind == "scaled" else 1.0)
+        return dual, self.relative_work * problem.velocity_scale * problem.impulse_scale
 
 
 def evaluate(problem: ConeProblem, impulse: NDArray, velocity: NDArray) -> Residuals:

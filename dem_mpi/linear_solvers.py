@@ -31,6 +31,8 @@ _SMALLEST_RELATIVE = 1e-16  # below it no residual falls
 # Memory of MUMPS's analysis on rank 0: row and column of each entry of one triangle, read from all
 # ranks, and about as much again for the graph that is ordered [B per entry of the matrix].
 _ANALYSIS_BYTES = 12.0
+_FEW_ROWS = 60  # of which any order of elimination is as good
+_LARGEST_LIMIT = 2**31 - 1  # [MB] that ICNTL(23) can hold
 
 
 class NewtonFailureError(DemError):
@@ -119,7 +121,8 @@ class Direct:
         if self._block > 1 and self._symmetric:
             factor.setMumpsIcntl(15, -self._block)
         if self._options.memory is not None:
-            factor.setMumpsIcntl(23, max(1, int(self._options.memory)))
+            limit = min(max(1.0, self._options.memory), _LARGEST_LIMIT)
+            factor.setMumpsIcntl(23, int(limit))
         self._adjust(factor)
         self._ksp.setFromOptions()
         self.analyses += 1
@@ -128,10 +131,25 @@ class Direct:
         options, key = PETSc.Options(), f"{PREFIX}mat_mumps_icntl_7"
         given = options.hasName(key)
         if not given:
-            options[key] = _ORDERINGS[self._options.ordering]
+            options[key] = _ORDERINGS[self._ordering()]
         self._ksp.setUp()
         if not given:
             options.delValue(key)
+
+    def _ordering(self) -> Ordering:
+        """Collective. The ordering asked for, or AMD where it is of no consequence.
+
+        PORD calls exit() on a graph in which every vertex is joined to every other: with fewer
+        than two classes of vertices there is nothing to separate. A single contact or pair makes
+        such a graph, and so do all contacts of one large body. MUMPS may take PORD of its own
+        accord, in place of an ordering that it was built without, too. From half full on (of an
+        unsymmetric matrix one triangle may be the whole graph) all orders fill the factor alike.
+        """
+        rows = self._matrix.getSize()[0]
+        entries = self._matrix.getInfo(self._matrix.InfoType.GLOBAL_SUM)["nz_used"]
+        if rows <= _FEW_ROWS or 2.0 * entries >= rows * (rows + 1.0):
+            return "amd"
+        return self._options.ordering
 
     def _choose_method(self, petsc: Any) -> None:
         self._ksp.setType(petsc.KSP.Type.PREONLY)
@@ -172,20 +190,9 @@ class Direct:
         rows = self._matrix.getSize()[0]
         what = f"MUMPS could not factorise the Newton matrix of {rows} rows"
         code = f"(INFOG(1) = {error}, INFOG(2) = {detail})"
-        limit = self._options.memory
         if error in _TOO_LITTLE_SPACE or error in _NO_MEMORY:
             phase = "analysis" if error in (-5, -7) else "factorisation"
-            asks = f"; it asks for {wanted} MB on the fullest rank, " if wanted > 0 else "; "
-            if limit is not None:
-                remedy = f"contact.scip.memory allows {limit:g} MB: raise it"
-            elif error in _NO_MEMORY:
-                remedy = "the machine has less: use more ranks on more nodes"
-            else:
-                remedy = f"contact.scip.workspace of {self._workspace} % was too little: raise it"
-            return (
-                f"{what}: too little memory in the {phase}{asks}{remedy}, try another "
-                f"contact.scip.ordering, or set contact.scip.linear: cg {code}"
-            )
+            return f"{what}: too little memory in the {phase}; {self._remedy(error, wanted)} {code}"
         if error in (-10, -40):
             return (
                 f"{what}: it is singular to working precision, or not positive definite; "
@@ -194,6 +201,23 @@ class Direct:
         if error in (-38, -39):
             return f"{what}: this MUMPS was built without the ordering asked for {code}"
         return f"{what}: error {error} of MUMPS, see INFOG(1) in its users' guide {code}"
+
+    def _remedy(self, error: int, wanted: int) -> str:
+        """What was allowed and what to do; MUMPS's estimate `wanted` [MB] is 0 where it has none.
+
+        The estimate is rounded, and of a small matrix it leaves out what MUMPS needs beside it: it
+        may lie below the limit that was not enough.
+        """
+        limit = self._options.memory
+        asks = f"it asks for {wanted} MB on the fullest rank, " if wanted > 0 else ""
+        if limit is not None:
+            least = f" to {wanted} or more" if wanted > limit else ""
+            remedy = f"contact.scip.memory = {limit:g} MB a rank is not enough: raise it{least}"
+        elif error in _NO_MEMORY:
+            remedy = f"{asks}the machine has less: use more ranks on more nodes"
+        else:
+            remedy = f"{asks}contact.scip.workspace of {self._workspace} % was too little: raise it"
+        return f"{remedy}, try another contact.scip.ordering, or set contact.scip.linear: cg"
 
     def solve(self, b: Any, x: Any, goal: float) -> int:
         """Collective. x = K^-1 b by two triangular solves."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -523,7 +524,11 @@ def test_too_small_a_memory_limit_for_the_factor_alone(parallel):
     system = case.system(parallel, NewtonOptions(form="velocity", memory=3.0))
     with pytest.raises(NewtonFailureError) as raised:
         case.solve(system)
-    assert "factorisation" in str(raised.value) and "contact.scip.memory" in str(raised.value)
+    text = str(raised.value)
+    assert "factorisation" in text and "contact.scip.memory = 3 MB a rank is not enough" in text
+    # No estimate that would contradict it is told beside the limit: only one beyond it.
+    wanted = [int(number) for number in re.findall(r"raise it to (\d+) or more", text)]
+    assert all(number > 3 for number in wanted)
     system.destroy()
 
 
@@ -558,6 +563,38 @@ def test_ordering_asked_for_is_the_one_used(parallel, ordering):
     used = system._form.solver._ksp.getPC().getFactorMatrix().getMumpsInfog(7)
     assert ordering == "auto" or used == numbers[ordering]
     system.destroy()
+
+
+def _around_a_large_one(count: int) -> tuple[NDArray, list[float]]:
+    """Small spheres spread over a large one, touching nothing else."""
+    height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
+    angle = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
+    around = np.sqrt(1.0 - height**2)
+    direction = np.stack([around * np.cos(angle), around * np.sin(angle), height], axis=1)
+    position = np.concatenate([np.zeros((1, 3)), 0.31 * direction]) + 0.5
+    return position, [0.3] + [0.011] * count
+
+
+# Graphs in which all vertices are joined: in bodies, in contacts or in both.
+COMPLETE = {
+    "one contact": ([[0.3, 0.5, 0.5], [0.5, 0.5, 0.5]], 0.12),
+    "three that touch": ([[0.4, 0.4, 0.5], [0.6, 0.4, 0.5], [0.5, 0.57, 0.5]], 0.105),
+    "forty on a large one": _around_a_large_one(40),
+}
+
+
+@pytest.mark.mpi(ranks=[1, 2])
+@pytest.mark.parametrize("ordering", ["auto", "pord", "metis"])
+@pytest.mark.parametrize("name", COMPLETE)
+@both_forms
+def test_a_graph_that_cannot_be_separated_ends_no_process(parallel, name, form, ordering):
+    """PORD calls exit() on a complete graph."""
+    for frictional in (True, False):
+        case = Spheres(parallel, cloud(*COMPLETE[name]), frictional)
+        system = case.system(parallel, NewtonOptions(form=form, ordering=ordering))
+        _, residual = case.solve(system)
+        assert residual <= 1e-12
+        system.destroy()
 
 
 def test_petsc_is_not_loaded_before_the_first_system():
