@@ -124,6 +124,7 @@ class Scip(Model):
         "Extra working space of a factorisation, in percent of MUMPS's estimate",
         default=35,
         ge=1,
+        le=1000,
     )
     memory: Positive | None = quantity(
         "MB",
@@ -193,7 +194,11 @@ class Contact(Model):
         "What a step does that misses its tolerance", default="continue_and_flag"
     )
     stop_factor: Positive = quantity(
-        "1", "The run stops when the residual exceeds this many tolerances", default=100.0, ge=1
+        "1",
+        "The run stops when a residual, of velocities or of complementarity, exceeds its tolerance "
+        "this many times",
+        default=100.0,
+        ge=1,
     )
 
 

@@ -82,6 +82,7 @@ class StepRecord:
     form: str
     factor_entries: int
     linear_residual: float
+    refinements: int
     converged: bool
     reason: str
     r_p: float
@@ -104,11 +105,35 @@ class StepRecord:
     removed: int
     removed_mass: float
     substeps: int
+    rejected: int
     rebuilt: bool
     moved: int
     ghosts: int
     imbalance: float
     bytes_sent: int
+
+
+@dataclass
+class _Effort:
+    """Sums over all solves of a step, also of those whose outcome was thrown away."""
+
+    solves: int = 0
+    iterations: int = 0
+    products: int = 0
+    factorisations: int = 0
+    outer: int = 0
+    refinements: int = 0
+    linear_residual: float = 0.0
+
+    def add(self, report: SolveReport) -> None:
+        """Count one solve."""
+        self.solves += 1
+        self.iterations += report.iterations
+        self.products += report.products
+        self.factorisations += report.factorisations
+        self.outer += report.outer
+        self.refinements += report.refinements
+        self.linear_residual = max(self.linear_residual, report.linear_residual)
 
 
 @dataclass(frozen=True)
@@ -179,6 +204,7 @@ class Simulation:
             )
         self._operator: MatrixFree | Assembled | None = None
         self._rebuilt, self._moved = False, 0
+        self._effort = _Effort()
 
     # ---- one step --------------------------------------------------------------------------
 
@@ -192,6 +218,7 @@ class Simulation:
         """
         state, h = self.state, self.scenario.time.step
         self._rebuilt, self._moved = False, 0
+        self._effort = _Effort()
         sent = self.parallel.bytes_sent
         time = state.step * h
         waiting = self._let_in(time)
@@ -233,6 +260,7 @@ class Simulation:
         posed = self._pose(time, h)
         with self.timer.phase("solve"):
             report = self._solver.solve(posed.problem, posed.guess, self.state.lipschitz)
+        self._effort.add(report)
         with self.timer.phase("advance"):
             # v+ = v_hat + M^-1 D gamma
             bodies, spin = self.state.bodies, self.state.bodies.angular_velocity
@@ -575,40 +603,64 @@ class Simulation:
 
     def _refuse(self, substep: _Substep, stop: bool) -> None:
         """Collective. Raise unless the scene lets a step that missed its tolerance pass."""
-        step, report = self.state.step + 1, substep.report
-        residuals = report.residuals
-        limit = self._tolerance.value
-        if self._tolerance.kind == "scaled":
-            limit *= substep.problem.velocity_scale
+        step, report, contact = self.state.step + 1, substep.report, self.scenario.contact
+        residuals, problem = report.residuals, substep.problem
+        merit = self._tolerance.merit(residuals, problem)
         if not residuals.finite:
             why = "a residual is not a number"
         elif stop:
             why = f"the solver missed its tolerance ({report.reason})"
-        elif residuals.dual > self.scenario.contact.stop_factor * limit:
+        elif merit > contact.stop_factor:
             why = (
-                f"the residual exceeds {self.scenario.contact.stop_factor:g} times the tolerance "
-                f"({report.reason})"
+                f"a residual exceeds {contact.stop_factor:g} times the tolerance ({report.reason})"
             )
         else:
             return
+        over, measure = self._largest_residual(substep)
+        low, high = self._worst_contact(substep.contacts, measure)
+        remedy = self._remedy(report)
+        raise SolverFailureError(
+            f"step {step}: {why}: {over}, worst at the contact of body {low} with "
+            f"{self._name(high)}{f'. {remedy}' if remedy else ''}"
+        )
+
+    def _largest_residual(self, substep: _Substep) -> tuple[str, NDArray]:
+        """The residual that is furthest over its limit, in words, and each contact's part (m,)."""
+        report, problem = substep.report, substep.problem
+        residuals, tolerance = report.residuals, self._tolerance
+        dual, work = tolerance.limits(problem)
+        scaled_dual = residuals.dual / dual
+        scaled_work = residuals.weighted_work / work if work > 0.0 else 0.0
+        if tolerance.kind != "thesis" and scaled_work > scaled_dual:
+            each = problem.weight * np.abs(np.sum(report.impulse * report.velocity, axis=1))
+            times, key = f"{scaled_work:.3g} times", "contact.complementarity"
+            return f"r_c = {residuals.weighted_work:.3g} J, {times} what {key} allows", each
         violation = -report.velocity[:, 0]
         if self.scenario.contact.law == "ccp":
             slip = np.sqrt(np.sum(report.velocity[:, 1:] ** 2, axis=1))
             violation += substep.contacts.friction * slip
-        low, high = self._worst_contact(substep.contacts, violation)
-        raise SolverFailureError(
-            f"step {step}: {why}: r_d = {residuals.dual:.3g} m/s, worst at the contact of body "
-            f"{low} with {self._name(high)}. {self._remedy(report)}, lower time.step, or set "
-            f"contact.on_failure: shrink_step"
-        )
+        if tolerance.kind == "thesis":
+            return f"the largest of the thesis's residuals is {residuals.thesis:.3g}", violation
+        times, key = f"{scaled_dual:.3g} times", "contact.tolerance"
+        return f"r_d = {residuals.dual:.3g} m/s, {times} what {key} allows", violation
 
     def _remedy(self, report: SolveReport) -> str:
+        """What may help; nothing more where the reason of the solver says it."""
         contact = self.scenario.contact
-        if report.outer == 1 and contact.solver == "apgd":
-            return "Raise contact.max_iterations, set contact.solver: auto"
-        if report.outer == 1 and report.factorisations >= contact.scip.max_iterations:
-            return "Raise contact.scip.max_iterations"
-        return "Loosen contact.tolerance and contact.complementarity"
+        if "contact." in report.reason:
+            return ""
+        limited = "iteration limit" in report.reason
+        if contact.solver == "apgd" and (limited or report.outer == 1):
+            first = "Raise contact.max_iterations, set contact.solver: auto"
+        elif limited and contact.solver == "scip":
+            first = "Raise contact.scip.max_iterations"
+        elif limited:
+            first = "Raise contact.max_iterations or contact.scip.max_iterations"
+        else:
+            first = "Loosen contact.tolerance and contact.complementarity"
+        if contact.on_failure == "shrink_step":
+            return f"{first}, or lower time.step"
+        return f"{first}, lower time.step, or set contact.on_failure: shrink_step"
 
     def _worst_contact(self, contacts: ContactSet, measure: NDArray) -> tuple[int, int]:
         """Collective. The gids of the contact with the largest, or an undefined, measure (m,)."""
@@ -628,10 +680,16 @@ class Simulation:
             return
         depth = -contacts.gap / self.state.bodies.smallest_size[contacts.a]
         low, high = self._worst_contact(contacts, depth)
+        missed, remedy = self.state.flagged, "lower time.step or contact.tolerance"
+        if missed:
+            # Their impulses were not what holds bodies apart.
+            remedy = (
+                f"{missed} of {self.state.step} steps before it missed their tolerance: lower "
+                f"contact.stop_factor to end at the first that is far off, or time.step"
+            )
         raise SolverFailureError(
             f"step {self.state.step + 1}: an overlap of {overlap:.2g} radii, over {allowed:.2g}, "
-            f"of body {low} with {self._name(high)}: bodies pass through each other; lower "
-            f"time.step or contact.tolerance",
+            f"of body {low} with {self._name(high)}: bodies pass through each other; {remedy}",
             intact=False,
         )
 
@@ -642,7 +700,7 @@ class Simulation:
 
     def _record(self, done: list[_Substep], outside: int, waiting: int, sent: int) -> StepRecord:
         """Collective. Sum up the substeps of a step over ranks."""
-        state, parallel, last = self.state, self.parallel, done[-1]
+        state, parallel, last, effort = self.state, self.parallel, done[-1], self._effort
         motion = integrator.measure(parallel, state.bodies)
         halo = self._neighbours.halo.ghosts if self._neighbours is not None else 0
         load = float(len(state.bodies) + last.contacts.count)
@@ -656,13 +714,14 @@ class Simulation:
             bodies=motion.bodies,
             contacts=int(counts[0]),
             solver=last.report.solver,
-            iterations=sum(s.report.iterations for s in done),
-            products=sum(s.report.products for s in done),
-            factorisations=sum(s.report.factorisations for s in done),
-            outer=sum(s.report.outer for s in done),
+            iterations=effort.iterations,
+            products=effort.products,
+            factorisations=effort.factorisations,
+            outer=effort.outer,
             form=last.report.form,
             factor_entries=last.report.factor_entries,
-            linear_residual=max(s.report.linear_residual for s in done),
+            linear_residual=effort.linear_residual,
+            refinements=effort.refinements,
             converged=not missed,
             reason=missed[0] if missed else "converged",
             r_p=max(r.primal for r in residuals),
@@ -685,6 +744,7 @@ class Simulation:
             removed=state.removed,
             removed_mass=state.removed_mass,
             substeps=len(done),
+            rejected=effort.solves - len(done),
             rebuilt=self._rebuilt,
             moved=self._moved,
             ghosts=int(counts[2]),

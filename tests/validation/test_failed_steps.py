@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dem_mpi import checkpoint
+from dem_mpi.cone import ConeProblem
 from dem_mpi.parallel import Parallel
 from dem_mpi.runner import RunOptions, run
 from dem_mpi.signals import StopRequest
@@ -55,6 +56,85 @@ def test_a_flagged_step_ends_the_run_beyond_stop_factor_tolerances() -> None:
         else:
             simulation.step()
         assert simulation.state.step == int(not stops)
+
+
+def make_useless(simulation: Simulation) -> None:
+    """Let every solve end without an impulse, not converged."""
+    solve = simulation._solver.solve
+
+    def failing(*arguments: object) -> SolveReport:
+        report = solve(*arguments)
+        idle = np.zeros_like(report.impulse)
+        return replace(report, impulse=idle, converged=False, reason="told to fail")
+
+    simulation._solver.solve = failing
+
+
+def make_work(simulation: Simulation, factor: float, reason: str) -> None:
+    """Let the next solve end, for `reason`, with a weighted work `factor` times its limit."""
+    solve, tolerance = simulation._solver.solve, simulation._tolerance
+
+    def failing(problem: ConeProblem, *arguments: object) -> SolveReport:
+        report = solve(problem, *arguments)
+        work = factor * tolerance.limits(problem)[1]
+        residuals = replace(report.residuals, dual=0.0, weighted_work=work, thesis=factor)
+        return replace(report, converged=False, reason=reason, residuals=residuals)
+
+    simulation._solver.solve = failing
+
+
+def test_stop_factor_heeds_complementarity_where_velocities_are_within_their_cones() -> None:
+    """Interior iterates have r_d = 0: only their work tells how far from a solution they are."""
+    for factor, stops in ((99.0, False), (101.0, True)):
+        simulation = pair_on_floor()
+        make_work(simulation, factor, "reached the iteration limit")
+        if stops:
+            with pytest.raises(SolverFailureError, match="exceeds 100 times the tol") as e:
+                simulation.step()
+            assert "r_c = " in str(e.value)
+            assert "101 times what contact.complementarity allows" in str(e.value)
+            assert "worst at the contact of body" in str(e.value)
+        else:
+            assert not simulation.step().converged
+
+
+def test_stop_factor_counts_in_the_measure_that_the_scene_chose() -> None:
+    """The thesis's residual is compared with the tolerance itself, r_c alone does not count."""
+    simulation = pair_on_floor(tolerance_kind="thesis", tolerance=1.0)
+    make_work(simulation, 99.0, "too hard")
+    assert not simulation.step().converged
+    simulation = pair_on_floor(tolerance_kind="thesis", tolerance=0.5)
+    make_work(simulation, 51.0, "too hard")
+    with pytest.raises(SolverFailureError, match="exceeds 100 times"):
+        simulation.step()
+
+
+@pytest.mark.parametrize(
+    ("solver", "reason", "advice", "unwanted"),
+    [
+        ("apgd", "reached the iteration limit", "Raise contact.max_iterations", "scip.max"),
+        ("scip", "reached the iteration limit", "Raise contact.scip.max_iterations", "Loosen"),
+        ("scip", "stalled", "Loosen contact.tolerance and contact.complementarity", "Raise"),
+        ("scip", "no memory: set contact.scip.linear: cg", r"body -?\d+|wall '\w+'$", "lower time"),
+    ],
+)
+def test_the_remedy_is_that_of_the_reason_and_told_once(solver, reason, advice, unwanted) -> None:
+    simulation = pair_on_floor(on_failure="stop", solver=solver)
+    make_work(simulation, 2.0, reason)
+    with pytest.raises(SolverFailureError, match=advice) as e:
+        simulation.step()
+    assert unwanted not in str(e.value)
+
+
+def test_attempts_that_were_thrown_away_count_as_work() -> None:
+    """A step that fails twice and is done in three pieces is five solves."""
+    plain = pair_on_floor(warm_start=False).step()
+    simulation = pair_on_floor(on_failure="shrink_step", warm_start=False)
+    make_fail(simulation, 2)
+    record = simulation.step()
+    assert (record.substeps, record.rejected, record.outer) == (3, 2, 5)
+    assert record.iterations >= plain.iterations + 3 and plain.rejected == 0
+    assert simulation.step().rejected == 0
 
 
 def test_on_failure_stop_refuses_the_step_and_keeps_the_state() -> None:
@@ -182,6 +262,14 @@ def test_an_overlap_that_runs_away_stops_the_run() -> None:
     assert not e.value.intact
     depth = R - simulation.state.bodies.position[0, 2]
     assert 0.5 * R < depth < 0.8 * R
+
+    assert "missed their tolerance" not in str(e.value)
+
+    scenario = scene(step=H, walls=[FLOOR], contact={"max_iterations": 1, "stop_factor": 1e9})
+    simulation = simulation_of(scenario, [[0, 0, R]], R, velocity=[0, 0, -1])
+    make_useless(simulation)
+    with pytest.raises(SolverFailureError, match=r"\d+ of \d+ steps before it missed their tol"):
+        advance(simulation, 20)
 
     deep = simulation_of(scene(step=H, gravity=(0, 0, 0)), [[0, 0, 0], [0.05, 0, 0]], R)
     assert deep.step().overlap == pytest.approx(1.5)
