@@ -62,9 +62,9 @@ _SHORT_STEP, _UNTOUCHED, _HIGHER, _RESTARTS = 0.2, 1e-3, 1e4, 4
 # The proximal term over N_nn. Larger ones keep more digits of the Newton systems in the
 # velocities, and make the way longer where impulses are not unique.
 _PROXIMAL = 1e-10
-# x.y of a contact over v_ref gamma_ref at which Newton's method is tried, and the part of it at
+# The largest gamma.g over v_ref gamma_ref at which Newton's method is tried, and the part of it at
 # which it is tried again; the mismatch over v_ref up to which it is tried when all else has failed.
-_CLOSE, _CLOSER, _NEAR = 1e-11, 1e-3, 1e-4
+_CLOSE, _CLOSER, _NEAR = 1e-10, 1e-3, 1e-4
 _HALF = 0.5  # that close, x.y falls at least by this from one iteration to the next, or it stalls
 # Where gamma.g is round-off, of impulses far above gamma_ref, a point is the better one if its
 # mismatch is this part of the other's, though gamma.g be larger by the second factor.
@@ -234,14 +234,16 @@ class Scip:
             if not path.rescale(run.g):
                 return "not a number in the iteration, or rounding left the cones"
             falling = improved or path.mean < 0.9 * mean or path.residual < 0.9 * residual
-            if path.mean <= close:
+            near = path.mean <= close
+            if near:
                 falling = path.mean < _HALF * mean
             stalled = 0 if falling else stalled + 1
             mean, residual = min(mean, path.mean), min(residual, path.residual)
             if stalled >= _PATIENCE:
                 return f"stalled: residuals and complementarity fall no more; {_NO_FURTHER}"
-            if path.mean <= again:
-                again = _CLOSER * path.mean
+            work = run.history[-1][2]
+            if near and work <= again:
+                again = _CLOSER * work
                 self._polish(run, quick=True)
                 if run.best_merit <= 1.0:
                     return "converged"

@@ -224,7 +224,9 @@ def test_the_interior_point_method_finds_the_velocities_of_clarabel(name, form):
     case = CASES[name]()
     if form == "velocity" and case.D is None:
         pytest.skip("a local problem has no bodies")
-    report = solved(case, SolverOptions("scip", scip=Scip(form=form)), 1e-12, 1e-15)
+    # The settled piles of 200 take 40 to 80, as rounding has it: a contact or another changes late.
+    scip = Scip(form=form, max_iterations=150)
+    report = solved(case, SolverOptions("scip", scip=scip), 1e-12, 1e-15)
     exact, _ = by_clarabel(name)
     assert apart(case, report.velocity, exact) <= VELOCITY, report.reason
     assert report.residuals.dual <= 1e-12 * case.problem.velocity_scale
