@@ -215,6 +215,7 @@ class Trial:
             "products": self.effort.products,
             "r_d": self.effort.dual,
             "converged": self.converged,
+            "unconverged": len(self.effort.failures),
             "reasons": sorted(set(self.effort.failures)),
             "checks": [asdict(check) for check in self.checks.values()],
         }

@@ -50,7 +50,9 @@ def test_hard_case_across_ranks(parallel: Parallel, name: str, solver: str) -> N
 def test_ten_bodies_stay_at_rest(solver: str, steps: int) -> None:
     """The same bound on the state as for ten thousand steps.
 
-    Leaves build/hard_cases/rest-<solver>.json, which scripts/bench/hard_cases.py tells of.
+    Leaves build/hard_cases/rest-<solver>.json, which scripts/bench/hard_cases.py tells of. In so
+    many steps round-off may hold a first-order method above 1e-8 v_ref gamma_ref now and then (N is
+    singular): it must say so, and the bound on the state holds for those steps as well.
     """
     trial = Trial(Parallel.alone(), solver)
     rest(trial, H, steps)
@@ -58,7 +60,8 @@ def test_ten_bodies_stay_at_rest(solver: str, steps: int) -> None:
     path = ROOT / "build" / "hard_cases" / f"rest-{solver}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(outcome, indent=1) + "\n")
-    assert trial.complaints == []
+    assert [str(check) for check in trial.checks.values() if not check.passed] == []
+    assert len(trial.effort.failures) <= 1e-5 * steps
 
 
 def commit() -> str:
