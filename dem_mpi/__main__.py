@@ -106,7 +106,7 @@ def run_command(
     set_threads(loaded.scenario.threads)
     started = perf_counter()
     contact, kinds = loaded.scenario.contact, (kind_of(loaded.scenario),)
-    warm_up(
+    compiled = warm_up(
         parallel,
         loaded.scenario.threads,
         (contact.operator,),
@@ -116,7 +116,7 @@ def run_command(
         contact.scip.form,
     )
     seconds = perf_counter() - started
-    if seconds > 2.0:
+    if compiled and seconds > 2.0:
         _print(f"compiled kernels in {seconds:.0f} s (first run only; kept in the numba cache)")
     options = RunOptions(out or Path("runs") / scene.stem, resume, force)
     run(parallel, loaded, options, STOP, _print)
@@ -131,7 +131,8 @@ def check(
     ] = 1,
 ) -> None:
     """Validate a scene and print what it would take; runs nothing."""
-    from dem_mpi.estimate import estimate
+    from dem_mpi.estimate import estimate, refuse_what_exceeds_its_limit, shortage
+    from dem_mpi.machine import installed_memory
     from dem_mpi.scenario import load_scenario
 
     loaded = load_scenario(scene, overrides or ())
@@ -139,6 +140,12 @@ def check(
         _print(f"warning: {warning}", error=True)
     for line in estimate(loaded.scenario, ranks).lines():
         _print(line)
+    refuse_what_exceeds_its_limit(loaded.scenario, ranks)
+    # Which nodes the ranks will be on is not known here: this is no error yet.
+    lacking = shortage(loaded.scenario, ranks, installed_memory() // ranks)
+    if lacking:
+        where = "with all ranks on this machine " if ranks > 1 else "on this machine "
+        _print(f"warning: {where}run would refuse: {lacking}", error=True)
 
 
 @app.command(epilog=_EPILOG)
@@ -212,6 +219,14 @@ def solve(
         int,
         typer.Option("--newton-iterations", min=1, help="Stop scip, not converged, after so many."),
     ] = 60,
+    max_outer: Annotated[
+        int,
+        typer.Option(
+            "--max-outer",
+            min=1,
+            help="Stop law coulomb, not converged, after so many cone problems.",
+        ),
+    ] = 100,
     form: Annotated[
         str,
         typer.Option(
@@ -270,6 +285,7 @@ def solve(
             solver=solver,
             law=law,
             newton_iterations=newton_iterations,
+            max_outer=max_outer,
             form=form,
             linear=linear,
         ),

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from dem_mpi.bodies import FIELDS
 from dem_mpi.errors import InputError
 from dem_mpi.scenario import Scenario, body_count, friction_table, frictional
-from dem_mpi.scene_models import only_spheres
+from dem_mpi.scene_models import Scip, only_spheres
 from dem_mpi.scene_walls import BoxWall
 from dem_mpi.sizes import mean_radius, mean_volume
 from dem_mpi.solvers.work import Size, elongation, factor_memory
@@ -260,22 +260,45 @@ def refuse_what_does_not_fit(scenario: Scenario, ranks: int, share: int) -> None
 
     With `solver: auto` they are made only where they fit.
     """
-    if scenario.contact.solver != "scip":
+    refuse_what_exceeds_its_limit(scenario, ranks)
+    lacking = shortage(scenario, ranks, share)
+    if lacking:
+        raise InputError(lacking)
+
+
+def refuse_what_exceeds_its_limit(scenario: Scenario, ranks: int) -> None:
+    """Raise InputError where factors would need far more than `contact.scip.memory` allows."""
+    scip = scenario.contact.scip
+    if scenario.contact.solver != "scip" or scip.memory is None:
         return
+    factors = estimate(scenario, ranks).factors
+    if factors > _DOUBT * scip.memory * 1e6:
+        raise InputError(
+            f"contact.scip.memory = {scip.memory:g} MB: factors of Newton matrices would take "
+            f"about {factors / 1e6:.0f} MB a rank; raise it, {_remedy(scenario)}"
+        )
+
+
+def shortage(scenario: Scenario, ranks: int, share: int) -> str:
+    """Say what a rank would need far more of than its `share` of memory [B]; "" if nothing."""
+    if scenario.contact.solver != "scip":
+        return ""
     found = estimate(scenario, ranks)
-    allowed = scenario.contact.scip.memory
-    remedy = "use more ranks, contact.scip.linear: cg, or contact.solver: auto"
-    if allowed is not None and found.factors > _DOUBT * allowed * 1e6:
-        raise InputError(
-            f"contact.scip.memory = {allowed:g} MB: factors of Newton matrices would take about "
-            f"{found.factors / 1e6:.0f} MB a rank; raise it, {remedy}"
-        )
-    if found.memory > _DOUBT * share:
-        raise InputError(
-            f"contact.solver = scip would take about {_size(found.memory)} a rank, "
-            f"{_size(found.factors)} of it for factors of Newton matrices, and this machine has "
-            f"{_size(share)}: {remedy}"
-        )
+    if found.memory <= _DOUBT * share:
+        return ""
+    return (
+        f"contact.solver = scip would take about {_size(found.memory)} a rank, "
+        f"{_size(found.factors)} of it for factors of Newton matrices, and this machine has "
+        f"{_size(share)}: {_remedy(scenario)}"
+    )
+
+
+def _remedy(scenario: Scenario) -> str:
+    """What makes factors take less, or do without."""
+    scip = scenario.contact.scip
+    generous = scip.workspace > Scip().workspace and scip.linear == "mumps"
+    less = f"lower contact.scip.workspace = {scip.workspace} %, " if generous else ""
+    return f"{less}use more ranks, contact.scip.linear: cg, or contact.solver: auto"
 
 
 def _freedoms(scenario: Scenario) -> int:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import product
+from typing import Any
 
 import numba
 import numpy as np
+from numba.core import event
 
 from dem_mpi.bodies import Bodies
 from dem_mpi.errors import InputError
@@ -38,7 +42,7 @@ walls:
 time: {{step: 1e-3, end: 2e-3}}
 threads: {threads}
 contact: {{operator: {operator}, solver: {solver}, law: {law}, max_iterations: 3,
-  tolerance: 1e-9, complementarity: 1e-9, stop_factor: 1e9, scip: {{form: {form}}}}}
+  tolerance: 1e-9, complementarity: 1e-9, stop_factor: 1e30, scip: {{form: {form}}}}}
 """
 # What solver: auto may call, and form: auto.
 _SOLVERS = {"apgd": ("apgd",), "scip": ("scip",), "auto": ("apgd", "scip")}
@@ -64,12 +68,13 @@ def warm_up(
     solvers: tuple[str, ...] = ("apgd",),
     law: str = "ccp",
     form: str = "auto",
-) -> None:
+) -> int:
     """Collective. Compile what these operators and kinds of scene use on rank 0, then load it.
 
     kinds : SPHERES, GENERAL or both; a scene with any body that is not a sphere is GENERAL.
     solvers, law, form : as in the contact section of a scene; nothing else is compiled, and PETSc
     is not even imported where neither operators nor solvers need it.
+    Returns how many variants of kernels this rank compiled, having found them in no cache.
     """
     called = [
         (solver, shape)
@@ -80,14 +85,36 @@ def warm_up(
         # PETSc starts on all ranks together: one that came alone would wait for the others.
         import petsc4py.PETSc  # noqa: F401
     error = None
-    for turn in (True, False):
-        if (parallel.rank == 0) == turn:
-            try:
-                for operator, kind, (solver, shape) in product(operators, kinds, called):
-                    _exercise(threads, operator, kind, solver, law, shape)
-            except Exception as caught:
-                error = caught
-        parallel.raise_together(error)
+    with _compilations() as compiled:
+        for turn in (True, False):
+            if (parallel.rank == 0) == turn:
+                try:
+                    for operator, kind, (solver, shape) in product(operators, kinds, called):
+                        _exercise(threads, operator, kind, solver, law, shape)
+                except Exception as caught:
+                    error = caught
+            parallel.raise_together(error)
+    return len(compiled)
+
+
+@contextmanager
+def _compilations() -> Iterator[list[Any]]:
+    """Yield a list to which every compilation within the block adds an item, and no load does."""
+
+    class Listener(event.Listener):
+        def on_start(self, found: event.Event) -> None:
+            begun.append(found)
+
+        def on_end(self, found: event.Event) -> None:
+            pass
+
+    begun: list[Any] = []
+    listener = Listener()
+    event.register("numba:compile", listener)
+    try:
+        yield begun
+    finally:
+        event.unregister("numba:compile", listener)
 
 
 def kind_of(scenario: Scenario) -> str:
