@@ -24,6 +24,8 @@ _BOUNDS = {
     "string_too_short": ("min_length", "must have at least {} character(s)"),
     "string_too_long": ("max_length", "must have at most {} characters"),
 }
+_LARGEST = 2.0**63  # whole numbers from here on are read as floats
+_TOO_LARGE = "must be a whole number of at most 18 digits"
 _UNION_MEMBERS = {"<number>", "<list>", "<uniform>", "<lognormal>", "<weighted>", "<mix>"}
 _TAG_STARTS = ("literal[", "tuple[", "[key]")
 _KINDS = {
@@ -117,12 +119,16 @@ def _rule(finding: Any, path: KeyPath, document: Document, schema: Schema) -> st
         key, text = _BOUNDS[kind]
         return text.format(f"{context[key]:g}") + _unit(path, document, schema)
     if kind == "int_type" and isinstance(value, float):
+        if abs(value) >= _LARGEST:
+            return _TOO_LARGE
         return "must be a whole number" + (f"; write {value:.0f}" if value.is_integer() else "")
     if kind in _KINDS:
         return f"must be {_KINDS[kind]}, not {describe(value)}" + _hint(kind, value)
     if kind == "finite_number":
         return "must be a finite number"
-    if kind in ("int_from_float", "int_parsing_size"):
+    if kind == "int_parsing_size":
+        return _TOO_LARGE
+    if kind == "int_from_float":
         return "must be a whole number"
     if kind == "literal_error":
         return _one_of(value, context["expected"].replace(" or ", ", "))
