@@ -176,6 +176,9 @@ class Contact(Model):
     max_iterations: Whole = quantity(
         "1", "Iterations of apgd per cone problem at most, under auto too", default=5000, ge=1
     )
+    max_outer: Whole = quantity(
+        "1", "Cone problems of a step at most, under law coulomb", default=100, ge=1
+    )
     scip: Scip = note("Interior point method", default=Scip())
     warm_start: Switch = note("Start from the impulses of the last step", default=True)
     recovery_speed: Positive | None = quantity(

@@ -61,6 +61,7 @@ class SolveOptions:
 
     solver, law, form, linear : as in the contact section of a scene
     max_iterations    : of apgd for a cone problem; newton_iterations : of scip
+    max_outer : cone problems under Coulomb's law
     guess : "solution" or the number of a guess of the file to start from; None starts from zero
     out   : file to write; force : replace it if it exists
     """
@@ -73,6 +74,7 @@ class SolveOptions:
     solver: Method = "apgd"
     law: Law = "ccp"
     newton_iterations: int = 60
+    max_outer: int = 100
     form: Form = "auto"
     linear: Linear = "mumps"
 
@@ -83,7 +85,12 @@ class SolveOptions:
             max_iterations=self.newton_iterations, form=self.form, linear=self.linear
         )
         return SolverOptions(
-            self.solver, self.law, self.tolerance, self.max_iterations, scip=section
+            self.solver,
+            self.law,
+            self.tolerance,
+            self.max_iterations,
+            scip=section,
+            max_outer=self.max_outer,
         )
 
 
@@ -107,6 +114,8 @@ def parse_options(
     for flag, (value, known) in words.items():
         if value not in get_args(known):
             raise InputError(f"{flag} {value}: must be one of {', '.join(get_args(known))}")
+    if options.linear == "cg" and options.form == "contact":
+        raise InputError("--linear cg: solves for velocities of bodies, not with --form contact")
     guess = options.guess
     if guess is not None and guess != "solution" and not (guess.isdecimal() and int(guess) > 0):
         raise InputError(f"--guess {guess}: must be 'solution' or the number of a guess, from 1")
@@ -140,7 +149,12 @@ def solve_file(
     problem = read_problem(parallel, path, options.guess)
     if options.form == "velocity" and problem.form == "local":
         raise InputError("--form velocity: a local problem has no M and H, it needs contact")
+    if options.linear == "cg" and problem.form == "local":
+        raise InputError("--linear cg: a local problem has no M and H, it needs mumps")
     operator = _operator(problem, parallel)
+    if options.linear == "cg" and not operator.symmetric:
+        operator.destroy()
+        raise InputError("--linear cg: M is not symmetric in this problem, it needs mumps")
     cone = cone_problem(operator, operator.offset, problem.mu, parallel)
     prepared = perf_counter() - started
     solver = make_solver(options.choice)
@@ -261,7 +275,7 @@ def _problem_lines(
     else:
         limit = most[options.solver]
     if options.law == "coulomb":
-        limit += " for each cone problem"
+        limit += f" for each of {options.max_outer} cone problems"
     return [
         f"{problem.path.name}{f' ({title})' if title else ''}: {problem.form} problem, "
         f"{problem.contacts.total} contacts, {problem.rows} rows, {matrices}, "
@@ -282,7 +296,10 @@ def _report_lines(
     kind = {"apgd": "iterations", "scip": "Newton iterations"}.get(
         solver, f"iterations, {report.factorisations} of them Newton's"
     )
-    rounds = f" in {report.outer} cone problems" if law == "coulomb" else ""
+    plural = "s" if report.outer > 1 else ""
+    rounds = f" in {report.outer} cone problem{plural}" if law == "coulomb" else ""
+    if report.converged and not report.iterations:
+        outcome = "converged: the start meets the tolerance"
     lines = [
         f"{outcome}: {report.iterations} {kind}{rounds}, {report.products} products with W, "
         f"{report.seconds['solve']:.3g} s (reading and set-up {prepared:.3g} s)",
@@ -334,7 +351,8 @@ def _stored_lines(
         cone.parallel.max_in_place(largest)
         lower = r.objective - report.residuals.objective
         # Only the relaxation makes the objective as small as it can be.
-        compared = f", ours is lower by {lower:.3e}" if law == "ccp" else ""
+        word = "higher" if lower < 0.0 else "lower"
+        compared = f", ours is {word} by {abs(lower):.3e}" if law == "ccp" else ""
         lines += [
             f"stored {_name(name)}: primal {r.primal:.3e} N s, dual {r.dual:.3e} m/s, "
             f"complementarity {r.complementarity:.3e} J",

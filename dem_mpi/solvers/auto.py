@@ -64,6 +64,7 @@ class Forecast:
         self._price, self._options = price, options
         self._lowest: list[float] = []  # logarithm of the least merit by iteration
         self._next_look = _FIRST_LOOK
+        self.ended = False  # whether it told them to end
 
     def __call__(self, iteration: int, products: int, merit: float) -> bool:
         """Take in one iteration; False to end. The same on all ranks, as its arguments are."""
@@ -77,7 +78,8 @@ class Forecast:
         if spent < options.free:
             return True
         left = remaining_iterations(self._lowest) * (products / iteration) / self._price
-        return left <= options.patience * (1.0 - spent / options.limit)
+        self.ended = left > options.patience * (1.0 - spent / options.limit)
+        return not self.ended
 
 
 def remaining_iterations(lowest: list[float]) -> float:
@@ -136,6 +138,8 @@ class Auto:
         first = self.apgd.solve(problem, guess, lipschitz, tolerance, forecast)
         if first.converged or not first.residuals.finite:
             return first
+        if forecast.ended:
+            first = replace(first, reason=f"made way for scip after {first.iterations} iterations")
         if refusal:
             return replace(first, reason=f"{first.reason}; {refusal}")
         second = self.scip.solve(problem, first.impulse.copy(), None, tolerance)
@@ -172,9 +176,12 @@ class Auto:
         """Collective. APGD from the better impulse, to the end of its iterations."""
         left = self.apgd.options.max_iterations - parts[0].iterations
         begin = _best(problem, tolerance, parts)
-        return self.apgd.solve(
+        report = self.apgd.solve(
             problem, begin.impulse.copy(), parts[0].lipschitz, tolerance, lambda k, *_: k < left
         )
+        if report.converged or report.iterations < left:
+            return report
+        return replace(report, reason="reached the iteration limit")
 
 
 def _allowed_memory(needed: float, limit: float | None, parallel: Parallel) -> tuple[float, str]:
@@ -204,7 +211,7 @@ def joined(problem: ConeProblem, tolerance: Tolerance, parts: list[SolveReport])
             seconds[phase] = seconds.get(phase, 0.0) + spent
     gradients = [part for part in parts if part.solver == "apgd"]
     newton = max(parts, key=lambda part: part.solver == "scip")
-    reason = "; then: ".join(part.reason for part in parts)
+    reason = "; then ".join(f"{part.solver}: {part.reason}" for part in parts)
     return replace(
         best,
         iterations=done,

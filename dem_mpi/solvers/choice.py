@@ -20,6 +20,7 @@ class SolverOptions:
     """Which method, for which law, to which tolerance.
 
     max_iterations : of APGD for a cone problem; scip : what the interior point method may do
+    max_outer : cone problems of a solve under Coulomb's law
     """
 
     solver: Literal["apgd", "scip", "auto"] = "apgd"
@@ -27,12 +28,20 @@ class SolverOptions:
     tolerance: Tolerance = field(default_factory=Tolerance)
     max_iterations: int = 5000
     scip: ScipSection = field(default_factory=ScipSection)
+    max_outer: int = 100
 
     @classmethod
     def of(cls, contact: Contact) -> SolverOptions:
         """Return the options of a scene's contact section."""
         tolerance = Tolerance(contact.tolerance, contact.tolerance_kind, contact.complementarity)
-        return cls(contact.solver, contact.law, tolerance, contact.max_iterations, contact.scip)
+        return cls(
+            contact.solver,
+            contact.law,
+            tolerance,
+            contact.max_iterations,
+            contact.scip,
+            contact.max_outer,
+        )
 
 
 def make_solver(options: SolverOptions) -> Solver:
@@ -44,7 +53,9 @@ def make_solver(options: SolverOptions) -> Solver:
 
     # Digits are cheap by Newton's method: fewer cone problems, each solved more closely.
     part = 1e-3 if options.solver == "scip" else CoulombOptions.coarsest
-    schedule = CoulombOptions(coarsest=part, finest=min(part, CoulombOptions.finest))
+    schedule = CoulombOptions(
+        max_outer=options.max_outer, coarsest=part, finest=min(part, CoulombOptions.finest)
+    )
     return Coulomb(inner, options.tolerance, schedule)
 
 

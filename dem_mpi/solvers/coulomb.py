@@ -15,8 +15,9 @@ all contacts together, are combined by Anderson acceleration (D. Anderson, J. AC
 begins anew after an iterate that does badly.
 
 Unlike the cone problem the law may have several solutions, or none (Painleve's paradoxes, large
-mu). Which of several is found depends on the guess; where none is, the report says so and holds the
-best impulse seen.
+mu), and F need not contract near one. Which of several is found depends on the guess. Where none
+is, the report says so and holds an impulse that keeps bodies apart: with a bias below mu |g_t|
+contacts that slide open a little, which adds no overlap, as they all do with the bias 0.
 
 Symbols: gamma impulse; g velocity; s bias; r its residual; theta weights of past differences.
 """
@@ -37,17 +38,26 @@ from dem_mpi.solvers.result import Solver, SolveReport
 
 # Merits below this are taken for it when the tolerance of a cone problem is set.
 _LAST = 10.0
-# A cone problem left unsolved is gone on from while the merit falls to this part of the best.
-_PROGRESS = 0.5
-# Directions of past differences below this part of the largest, in squares, are noise.
-_INDEPENDENT = 1e-10
+# The iteration ends after cone problems left unsolved in a row, none of which brought the merit
+# down to this part of the best.
+_PROGRESS, _UNSOLVED = 0.5, 3
+# gamma.g that a cone problem may keep, over v_ref gamma_ref, and over what its dual residual may be
+# over v_ref. An interior point has g of the right sign long before its impulses are small enough.
+_WORK = 10.0
+# Past differences are those of cone problems solved to a part of the merit: what they say below
+# this part of the largest, in squares, is noise.
+_NOISE = 1e-2
+# Where no solution is found the bias is lowered so many times, by this multiple of what it exceeds
+# mu |g_t| by. If contacts close even then at so many tolerances it is taken away altogether, for
+# what overlaps is worse than what opens.
+_LOWERINGS, _BELOW, _FAR = 10, 3.0, 30.0
 
 
 @dataclass(frozen=True)
 class CoulombOptions:
     """Options of `Coulomb`.
 
-    max_outer    : cone problems at most
+    max_outer    : cone problems at most, and up to 11 more where they find no solution
     coarsest     : each is solved to this part of the smallest merit so far, early ones coarsely;
                    a merit below 10 tolerances counts as 10: the bias has its share in the last one
     finest       : the part is halved down to this while the merit does not
@@ -60,7 +70,7 @@ class CoulombOptions:
     coarsest: float = 0.05
     finest: float = 0.02
     relaxation: float = 0.7
-    memory: int = 5
+    memory: int = 10
     restart: float = 10.0
 
 
@@ -106,24 +116,22 @@ class Coulomb:
         acceleration = _Anderson(options.memory, parallel)
         totals = _Totals()
         best: _Iterate | None = None
-        reason = "reached the limit of outer iterations"
+        reason = f"reached the limit of {options.max_outer} cone problems, contact.max_outer"
+        unsolved = 0
         while totals.outer < options.max_outer:
             # A guess that obeys the law already is taken as it is.
             finer = part * max(least, _LAST) if least > 1.0 else 1.0
-            report = self.inner.solve(
-                _biased(problem, s), gamma.copy(), lipschitz, _times(tolerance, finer)
-            )
-            gamma, g, lipschitz = report.impulse, _lifted(report.velocity, -s), report.lipschitz
-            residuals = law_residuals(problem, gamma, g)
-            merit = _merit(tolerance, residuals, problem)
-            totals.add(report, residuals)
+            found = self._iterate(problem, s, gamma, lipschitz, tolerance, finer, totals)
+            gamma, g, lipschitz = found.impulse, found.velocity, found.inner.lipschitz
+            merit = found.merit
             progress = best is None or merit < _PROGRESS * best.merit
+            unsolved = 0 if found.inner.converged or progress else unsolved + 1
             if best is None or merit < best.merit:
-                best = _Iterate(gamma, g, residuals, merit, report)
+                best = found
             if merit <= 1.0:
                 break
-            if not math.isfinite(merit) or not (report.converged or progress):
-                reason = f"cone problem {totals.outer}: {report.reason}"
+            if not math.isfinite(merit) or unsolved == _UNSOLVED:
+                reason = f"cone problem {totals.outer}: {found.inner.reason}"
                 break
             if merit > options.restart * best.merit:
                 acceleration.restart()
@@ -135,7 +143,56 @@ class Coulomb:
             r[slides] *= newton[slides]
             # Where a contact stays open its bias is of no consequence, and no part of the fit.
             s = np.maximum(s + acceleration.step(s, r, closed), 0.0)
+        if best.merit > 1.0 and math.isfinite(best.merit):
+            best = self._kept_apart(problem, best, lipschitz, tolerance, totals)
         return totals.report(best, reason, lipschitz)
+
+    def _iterate(
+        self,
+        problem: ConeProblem,
+        s: NDArray,
+        guess: NDArray,
+        lipschitz: float | None,
+        tolerance: Tolerance,
+        finer: float,
+        totals: _Totals,
+    ) -> _Iterate:
+        """Collective. Solve the cone problem of the bias s (m,), to `finer` tolerances."""
+        wanted = _inner_tolerance(tolerance, finer, problem)
+        report = self.inner.solve(_biased(problem, s), guess.copy(), lipschitz, wanted)
+        g = _lifted(report.velocity, -s)
+        residuals = law_residuals(problem, report.impulse, g)
+        totals.add(report, residuals)
+        return _Iterate(
+            report.impulse, g, s, residuals, _merit(tolerance, residuals, problem), report
+        )
+
+    def _kept_apart(
+        self,
+        problem: ConeProblem,
+        best: _Iterate,
+        lipschitz: float | None,
+        tolerance: Tolerance,
+        totals: _Totals,
+    ) -> _Iterate:
+        """Collective. An iterate that closes no contact, near one that is not good enough.
+
+        The cone problem gives g_n >= mu |g_t| - s: with less bias than mu |g_t| nothing closes.
+        """
+        now = best
+        for step in range(_LOWERINGS + 1):
+            closing = _closing_merit(tolerance, best.residuals, problem)
+            if closing <= (1.0 if step < _LOWERINGS else _FAR):
+                break
+            excess = np.maximum(now.bias - slip_bias(problem.mu, now.velocity), 0.0)
+            margin = _BELOW * excess if step < _LOWERINGS else math.inf
+            s = np.maximum(now.bias - margin, 0.0)
+            now = self._iterate(problem, s, now.impulse, lipschitz, tolerance, 0.5, totals)
+            if not now.residuals.finite:
+                break
+            if now.residuals.dual < best.residuals.dual:
+                best = now
+        return best
 
     def destroy(self) -> None:
         """Collective. Free what the inner solver keeps between solves."""
@@ -182,9 +239,20 @@ def _start(problem: ConeProblem, guess: NDArray) -> tuple[NDArray, NDArray]:
     return gamma, g
 
 
-def _times(tolerance: Tolerance, factor: float) -> Tolerance:
+def _inner_tolerance(tolerance: Tolerance, factor: float, problem: ConeProblem) -> Tolerance:
+    """Tolerance of a cone problem: the law's times a factor, the work tied to the velocity."""
     value, work = factor * tolerance.value, factor * tolerance.relative_work
+    if tolerance.kind != "thesis" and problem.velocity_scale > 0.0:
+        scale = 1.0 if tolerance.kind == "scaled" else problem.velocity_scale
+        work = min(work, _WORK * value / scale)
     return replace(tolerance, value=value, relative_work=work)
+
+
+def _closing_merit(tolerance: Tolerance, residuals: Residuals, problem: ConeProblem) -> float:
+    """The largest closing velocity over its limit."""
+    if tolerance.kind == "thesis":
+        return residuals.dual / tolerance.value
+    return tolerance.merit_of(residuals.dual, 0.0, problem)
 
 
 def _merit(tolerance: Tolerance, residuals: Residuals, problem: ConeProblem) -> float:
@@ -257,19 +325,20 @@ class _Anderson:
 
 
 def _weights(gram: NDArray, rhs: NDArray) -> NDArray:
-    """Least-squares solution (k,) of gram theta = rhs, in rows and columns of unit diagonal."""
+    """Damped least-squares solution (k,) of gram theta = rhs, in rows and columns of diagonal 1."""
     scale = np.sqrt(np.diag(gram))
     scale[scale == 0.0] = 1.0
-    scaled = gram / np.outer(scale, scale)
-    return np.linalg.lstsq(scaled, rhs / scale, rcond=_INDEPENDENT)[0] / scale
+    scaled = gram / np.outer(scale, scale) + _NOISE * np.eye(len(gram))
+    return np.linalg.solve(scaled, rhs / scale) / scale
 
 
 @dataclass(frozen=True)
 class _Iterate:
-    """An impulse and how well it obeys the law; velocity is N gamma + b."""
+    """An impulse and how well it obeys the law; velocity is N gamma + b, bias what made it."""
 
     impulse: NDArray
     velocity: NDArray
+    bias: NDArray
     residuals: Residuals
     merit: float
     inner: SolveReport
@@ -286,6 +355,7 @@ class _Totals:
     refinements: int = 0
     factor_entries: int = 0
     linear_residual: float = 0.0
+    form: str = ""
     seconds: Counter[str] = field(default_factory=Counter)
     history: list[tuple[float, ...]] = field(default_factory=list)
 
@@ -298,6 +368,7 @@ class _Totals:
         self.refinements += report.refinements
         self.factor_entries = max(self.factor_entries, report.factor_entries)
         self.linear_residual = max(self.linear_residual, report.linear_residual)
+        self.form = report.form or self.form
         self.seconds.update(report.seconds)
         self.history.append(
             (self.iterations, residuals.dual, residuals.weighted_work, residuals.objective)
@@ -317,6 +388,7 @@ class _Totals:
             refinements=self.refinements,
             factor_entries=self.factor_entries,
             linear_residual=self.linear_residual,
+            form=self.form,
             outer=self.outer,
             seconds=dict(self.seconds),
             history=np.array(self.history),
