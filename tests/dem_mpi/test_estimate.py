@@ -132,6 +132,48 @@ def test_factors_that_cannot_fit_are_refused_before_anything_is_done():
     refuse(text, 2**35)
 
 
+def check(scene: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "dem_mpi", "check", scene, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
+
+
+def test_check_says_what_run_will_say_of_factors(tmp_path):
+    """A limit that a run refuses is refused by check, in the same words; memory here warns."""
+    scene = tmp_path / "scene.yaml"
+    text = DENSE.format(mu=0.3, count=16**3, side=16 * 0.02005)
+    scene.write_text(text.replace("tolerance: 1, complementarity: 1", SCIP))
+    limit = ("--set", "contact.scip.memory=1")
+    checked = check(scene, *limit)
+    ran = run_ranks(1, ["-m", "dem_mpi", "run", scene, "--out", tmp_path / "out", *limit])
+    assert checked.returncode == ran.returncode == 64
+    assert "contact.scip.memory = 1 MB: factors of Newton matrices" in checked.stderr
+    assert checked.stderr.strip() == ran.stderr.strip()
+    assert "memory       about" in checked.stdout
+
+    fits = check(scene)
+    assert fits.returncode == 0 and "refuse" not in fits.stderr
+    large = DENSE.format(mu=0.3, count=1_900_000, side=200 * 0.02005)
+    scene.write_text(large.replace("tolerance: 1, complementarity: 1", SCIP))
+    short = check(scene)
+    assert short.returncode == 0
+    assert re.search(r"warning: on this machine run would refuse: .*this machine has", short.stderr)
+
+
+def test_a_generous_workspace_is_named_where_factors_do_not_fit():
+    text = DENSE.format(mu=0.3, count=16**3, side=16 * 0.02005)
+    text = text.replace("tolerance: 1, complementarity: 1", SCIP)
+    wide = text.replace("max_iterations: 1}", "workspace: 1000, memory: 100}")
+    usual = text.replace("max_iterations: 1}", "memory: 10}")
+
+    def refusal(text: str) -> str:
+        with pytest.raises(InputError) as refused:
+            refuse_what_does_not_fit(parse_scenario(text, "scene.yaml").scenario, 1, 2**50)
+        return str(refused.value)
+
+    assert "lower contact.scip.workspace = 1000 %" in refusal(wide)
+    assert "workspace" not in refusal(usual)
+
+
 def test_contacts_and_files_of_a_settled_bed_are_foretold(tmp_path):
     text = BED.format(height=0.5)
     foretold = estimate_of(text)

@@ -803,6 +803,22 @@ def test_local_problem_has_no_velocity_form():
     assert done.returncode == 64 and "a local problem has no M and H" in done.stderr
 
 
+def test_conjugate_gradients_are_refused_where_there_are_no_velocities():
+    done = command(CAPSULES, "--solver", "scip", "--linear", "cg")
+    assert done.returncode == 64 and "--linear cg: a local problem has no M" in done.stderr
+    done = command(CAPSULES, "--solver", "scip", "--linear", "cg", "--form", "contact")
+    assert done.returncode == 64 and "not with --form contact" in done.stderr
+
+
+def test_conjugate_gradients_are_refused_where_the_mass_matrix_is_not_symmetric(tmp_path):
+    """As by an implicit gyroscopic term."""
+    M, *rest = packing()
+    M[0, 1] += 1e-3 * np.sqrt(M[0, 0] * M[1, 1])
+    path = put_global(tmp_path / "turning.hdf5", M, *rest)
+    done = command(path, "--solver", "scip", "--linear", "cg")
+    assert done.returncode == 64 and "--linear cg: M is not symmetric" in done.stderr
+
+
 def test_page_shows_what_the_program_prints():
     page = (ROOT / "docs" / "fclib.md").read_text()
     samples = re.findall(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -54,3 +55,20 @@ def test_every_kernel_of_the_interior_point_method_is_compiled_before_the_first_
     # Helpers that start with an underscore are compiled into their callers.
     assert [name for name, n in new.items() if n == 0 and " _" not in name] == []
     assert found["_kernels_solver gradient_step"] == (1 if solver == "auto" else 0)
+
+
+def test_a_cache_that_holds_the_kernels_counts_as_no_compilation(tmp_path):
+    """What is loaded was not compiled, however long it takes."""
+    program = "from dem_mpi.parallel import Parallel; from dem_mpi.warmup import warm_up;"
+    program += "print(warm_up(Parallel.alone(), 1))"
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+
+    def compilations() -> int:
+        done = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, cwd=ROOT,
+            env=environment, timeout=300, check=True,
+        )  # fmt: skip
+        return int(done.stdout)
+
+    assert compilations() > 10
+    assert compilations() == 0
