@@ -217,6 +217,11 @@ class Assembled:
             contacts.normal, contacts.arm, contacts.a, contacts.b,
             self.columns if general else self._dof, self._body_columns, indptr, indices, values,
         )  # fmt: skip
+        second = contacts.b >= 0
+        column = self._body_columns
+        if np.any(column[contacts.a[second]] == column[contacts.b[second]]):
+            # A body and an image of itself: PETSc would keep one of the two entries of a column.
+            return _merged(indptr, indices, values)
         return indptr, indices, values
 
     def _mass_rows(self, inverse_inertia: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -313,6 +318,16 @@ def _is_general(contacts: ContactSet) -> bool:
 def _freedoms(contacts: ContactSet, frictional: bool) -> int:
     """Degrees of freedom of a body: 3 only where no contact can turn it."""
     return 6 if frictional or _is_general(contacts) else 3
+
+
+def _merged(indptr: NDArray, indices: NDArray, values: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    """Rows with entries of the same column added up."""
+    from scipy import sparse  # rarely needed: periods are longer than bodies in a simulation
+
+    width = int(indices.max(initial=-1)) + 1
+    rows = sparse.csr_matrix((values, indices, indptr), shape=(len(indptr) - 1, width))
+    rows.sum_duplicates()
+    return rows.indptr.astype(indptr.dtype), rows.indices.astype(indices.dtype), rows.data
 
 
 def _unit_masses(inverse_mass: NDArray, inverse_inertia: NDArray) -> tuple[NDArray, NDArray]:
