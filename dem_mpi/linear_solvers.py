@@ -43,7 +43,8 @@ class NewtonFailureError(DemError):
 class DirectOptions:
     """Options of MUMPS.
 
-    ordering  : of the elimination; "auto" lets MUMPS choose
+    ordering  : of the elimination; "auto" lets MUMPS choose; tiny or nearly full matrices, where
+                it is of no consequence, always take AMD
     workspace : extra working space of the factorisation [%] (ICNTL(14))
     memory    : limit of MUMPS's memory on each rank [MB] (ICNTL(23)); None for no limit
     """

@@ -116,7 +116,7 @@ class Scip(Model):
     )
     ordering: Literal["auto", "amd", "metis", "scotch", "pord"] = note(
         "Order of elimination, which memory and time of a factorisation depend on; auto: MUMPS's "
-        "choice",
+        "choice. Tiny or nearly full matrices take amd",
         default="auto",
     )
     workspace: Whole = quantity(
