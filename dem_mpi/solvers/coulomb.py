@@ -16,8 +16,7 @@ begins anew after an iterate that does badly.
 
 Unlike the cone problem the law may have several solutions, or none (Painleve's paradoxes, large
 mu), and F need not contract near one. Which of several is found depends on the guess. Where none
-is, the report says so and holds an impulse that keeps bodies apart: with a bias below mu |g_t|
-contacts that slide open a little, which adds no overlap, as they all do with the bias 0.
+is, the report says so and holds the best impulse seen.
 
 Symbols: gamma impulse; g velocity; s bias; r its residual; theta weights of past differences.
 """
@@ -47,17 +46,19 @@ _WORK = 10.0
 # Past differences are those of cone problems solved to a part of the merit: what they say below
 # this part of the largest, in squares, is noise.
 _NOISE = 1e-2
-# Where no solution is found the bias is lowered so many times, by this multiple of what it exceeds
-# mu |g_t| by. If contacts close even then at so many tolerances it is taken away altogether, for
-# what overlaps is worse than what opens.
-_LOWERINGS, _BELOW, _FAR = 10, 3.0, 30.0
+# Bold and careful steps take turns when the merit has not halved for so many cone problems. Careful
+# ones are a part of the plain fixed point's, with little of what past differences say.
+_STALLED, _CAREFUL, _MORE_NOISE = 20, 0.7, 1e-1
+# From a best iterate that is so many tolerances off the bias is lowered up to so often by so many
+# times what it exceeds mu |g_t| by: contacts that close may do worse than some that open.
+_FAR, _LOWERINGS, _BELOW = 30.0, 10, 3.0
 
 
 @dataclass(frozen=True)
 class CoulombOptions:
     """Options of `Coulomb`.
 
-    max_outer    : cone problems at most, and up to 11 more where they find no solution
+    max_outer    : cone problems at most, and up to 10 more to better a poor end
     coarsest     : each is solved to this part of the smallest merit so far, early ones coarsely;
                    a merit below 10 tolerances counts as 10: the bias has its share in the last one
     finest       : the part is halved down to this while the merit does not
@@ -113,7 +114,8 @@ class Coulomb:
         diagonal = problem.operator.diagonal()
         part = options.coarsest
         newton = 1.0 + options.relaxation * _single_contact_gain(problem.mu, diagonal)
-        acceleration = _Anderson(options.memory, parallel)
+        acceleration, careful = _Anderson(options.memory, parallel, _NOISE), False
+        mark, stalled = math.inf, 0
         totals = _Totals()
         best: _Iterate | None = None
         reason = f"reached the limit of {options.max_outer} cone problems, contact.max_outer"
@@ -133,19 +135,50 @@ class Coulomb:
             if not math.isfinite(merit) or unsolved == _UNSOLVED:
                 reason = f"cone problem {totals.outer}: {found.inner.reason}"
                 break
-            if merit > options.restart * best.merit:
+            stalled = 0 if merit < _PROGRESS * mark else stalled + 1
+            mark = merit if stalled == 0 else mark
+            if stalled == _STALLED:
+                careful, stalled = not careful, 0
+                noise = _MORE_NOISE if careful else _NOISE
+                acceleration = _Anderson(options.memory, parallel, noise)
+            elif merit > options.restart * best.merit:
                 acceleration.restart()
             if merit > _PROGRESS * least:
                 part = max(0.5 * part, min(options.finest, options.coarsest))
             least = best.merit
             r = slip_bias(problem.mu, g) - s
             closed, slides = _standing(problem.mu, diagonal, gamma, g, r)
-            r[slides] *= newton[slides]
+            if careful:
+                r *= _CAREFUL
+            else:
+                r[slides] *= newton[slides]
             # Where a contact stays open its bias is of no consequence, and no part of the fit.
             s = np.maximum(s + acceleration.step(s, r, closed), 0.0)
-        if best.merit > 1.0 and math.isfinite(best.merit):
-            best = self._kept_apart(problem, best, lipschitz, tolerance, totals)
+        if _FAR < best.merit < math.inf:
+            best = self._lowered(problem, best, lipschitz, tolerance, totals)
         return totals.report(best, reason, lipschitz)
+
+    def _lowered(
+        self,
+        problem: ConeProblem,
+        best: _Iterate,
+        lipschitz: float | None,
+        tolerance: Tolerance,
+        totals: _Totals,
+    ) -> _Iterate:
+        """Collective. The best of iterates with less and less bias, beginning with this one's.
+
+        A cone problem gives g_n >= mu |g_t| - s: where s is at most mu |g_t| nothing closes.
+        """
+        now = best
+        for _ in range(_LOWERINGS):
+            excess = np.maximum(now.bias - slip_bias(problem.mu, now.velocity), 0.0)
+            s = np.maximum(now.bias - _BELOW * excess, 0.0)
+            now = self._iterate(problem, s, now.impulse, lipschitz, tolerance, 0.5, totals)
+            best = now if now.merit < best.merit else best
+            if best.merit <= _FAR or not now.residuals.finite:
+                break
+        return best
 
     def _iterate(
         self,
@@ -166,33 +199,6 @@ class Coulomb:
         return _Iterate(
             report.impulse, g, s, residuals, _merit(tolerance, residuals, problem), report
         )
-
-    def _kept_apart(
-        self,
-        problem: ConeProblem,
-        best: _Iterate,
-        lipschitz: float | None,
-        tolerance: Tolerance,
-        totals: _Totals,
-    ) -> _Iterate:
-        """Collective. An iterate that closes no contact, near one that is not good enough.
-
-        The cone problem gives g_n >= mu |g_t| - s: with less bias than mu |g_t| nothing closes.
-        """
-        now = best
-        for step in range(_LOWERINGS + 1):
-            closing = _closing_merit(tolerance, best.residuals, problem)
-            if closing <= (1.0 if step < _LOWERINGS else _FAR):
-                break
-            excess = np.maximum(now.bias - slip_bias(problem.mu, now.velocity), 0.0)
-            margin = _BELOW * excess if step < _LOWERINGS else math.inf
-            s = np.maximum(now.bias - margin, 0.0)
-            now = self._iterate(problem, s, now.impulse, lipschitz, tolerance, 0.5, totals)
-            if not now.residuals.finite:
-                break
-            if now.residuals.dual < best.residuals.dual:
-                best = now
-        return best
 
     def destroy(self) -> None:
         """Collective. Free what the inner solver keeps between solves."""
@@ -248,13 +254,6 @@ def _inner_tolerance(tolerance: Tolerance, factor: float, problem: ConeProblem) 
     return replace(tolerance, value=value, relative_work=work)
 
 
-def _closing_merit(tolerance: Tolerance, residuals: Residuals, problem: ConeProblem) -> float:
-    """The largest closing velocity over its limit."""
-    if tolerance.kind == "thesis":
-        return residuals.dual / tolerance.value
-    return tolerance.merit_of(residuals.dual, 0.0, problem)
-
-
 def _merit(tolerance: Tolerance, residuals: Residuals, problem: ConeProblem) -> float:
     return tolerance.merit(residuals, problem) if residuals.finite else math.inf
 
@@ -286,11 +285,12 @@ class _Anderson:
     """Steps towards r(s) = 0 that differences of past (s, r) suggest.
 
     With theta the weights for which |r - sum theta_j dr_j| is least, over the closed contacts,
-    the step is r - sum theta_j (ds_j + dr_j).
+    the step is r - sum theta_j (ds_j + dr_j). Differences below the part `noise` of the largest, in
+    squares, count for little.
     """
 
-    def __init__(self, memory: int, parallel: Parallel) -> None:
-        self._memory, self._parallel = memory, parallel
+    def __init__(self, memory: int, parallel: Parallel, noise: float) -> None:
+        self._memory, self._parallel, self._noise = memory, parallel, noise
         self.restart()
 
     def restart(self) -> None:
@@ -320,15 +320,15 @@ class _Anderson:
         products[:, :k] = np.einsum("im,jm->ij", fitted, fitted)
         products[:, k] = np.einsum("im,m->i", fitted, r)
         self._parallel.sum_in_place(products)
-        theta = self._parallel.broadcast(_weights(products[:, :k], products[:, k]))
+        theta = self._parallel.broadcast(_weights(products[:, :k], products[:, k], self._noise))
         return r - np.einsum("i,im->m", theta, ds + dr) * closed
 
 
-def _weights(gram: NDArray, rhs: NDArray) -> NDArray:
+def _weights(gram: NDArray, rhs: NDArray, noise: float) -> NDArray:
     """Damped least-squares solution (k,) of gram theta = rhs, in rows and columns of diagonal 1."""
     scale = np.sqrt(np.diag(gram))
     scale[scale == 0.0] = 1.0
-    scaled = gram / np.outer(scale, scale) + _NOISE * np.eye(len(gram))
+    scaled = gram / np.outer(scale, scale) + noise * np.eye(len(gram))
     return np.linalg.solve(scaled, rhs / scale) / scale
 
 

@@ -293,15 +293,16 @@ def test_counts_are_sums_over_cone_problems_solved_from_coarse_to_fine():
     assert inner.solver is None
 
 
-def test_limit_of_outer_iterations_leaves_an_iterate_that_closes_no_contact_and_says_so():
-    """The law's residuals of the best of three cone problems close at 1e-3 v_ref and more."""
+def test_limit_of_outer_iterations_leaves_the_best_iterate_and_says_so():
     problem = random_problem(15, 2, 1.5)
     report = solve(problem, max_outer=3)
     assert not report.converged
     assert report.reason == "reached the limit of 3 cone problems, contact.max_outer"
-    assert 3 < report.outer <= 3 + 11
-    assert report.history[:3, 1].min() > 1e-3 * problem.velocity_scale
-    assert report.residuals.dual <= 1e-9 * problem.velocity_scale
+    assert 3 <= report.outer <= 13
+    scale = problem.velocity_scale * np.array([1.0, problem.impulse_scale])
+    merits = (report.history[:, 1:3] / scale).max(axis=1)
+    found = np.array([report.residuals.dual, report.residuals.weighted_work]) / scale
+    assert found.max() == merits.min()
     again = law_residuals(problem, report.impulse, report.velocity)
     assert again == report.residuals
 
