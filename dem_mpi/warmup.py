@@ -42,7 +42,7 @@ walls:
 time: {{step: 1e-3, end: 2e-3}}
 threads: {threads}
 contact: {{operator: {operator}, solver: {solver}, law: {law}, max_iterations: 3,
-  tolerance: 1e-9, complementarity: 1e-9, stop_factor: 1e30, scip: {{form: {form}}}}}
+  tolerance: 1e-12, complementarity: 1e-15, stop_factor: 1e30, scip: {{form: {form}}}}}
 """
 # What solver: auto may call, and form: auto.
 _SOLVERS = {"apgd": ("apgd",), "scip": ("scip",), "auto": ("apgd", "scip")}

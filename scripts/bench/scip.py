@@ -128,7 +128,7 @@ def pieces(quick: bool) -> list[Piece]:
     def add(part: str, state: str, method: str, ranks: int, *tolerances: float, **more: Any):
         found.append(Piece(part, state, method, ranks, tolerances, **more))
 
-    sizes = (500, 2000) if quick else (500, 2000, 5000, 16000)
+    sizes = (500, 2000) if quick else (500, 2000, 8000, 16000)
     for size in reversed(sizes):
         state, runs = f"pile-{size}/settled", 5 if size <= 2000 else 1
         for ranks in (2, 1):

@@ -84,7 +84,7 @@ def _cloud(spheres: int, end: float, tolerance: float) -> Recipe:
 RECIPES = {
     recipe.name: recipe
     for recipe in (
-        *(_pile(n) for n in (500, 2000, 5000, 16000)),
+        *(_pile(n) for n in (500, 2000, 8000, 16000)),
         # A pile to be polished by an accurate solver: begun compact, in large steps.
         Recipe(
             "pile-100000", 100_000, 0.01, 1.0, 0.0212, 2.5e-3, 0.75, 1e-2, 0.05, 0.05,
