@@ -80,6 +80,8 @@ def test_with_the_interior_point_method_too_on_one_rank(parallel, shared_path, f
 @pytest.mark.mpi(ranks=[1])
 def test_with_a_solver_chosen_in_every_step_too_on_one_rank(parallel, shared_path):
     scene = SHORT.replace("contact: {", "contact: {solver: auto, ")
+    scene = scene.replace("tolerance: 1e-3, complementarity: 1e-2, max_iterations: 25",
+                          "tolerance: 1e-6, complementarity: 1e-5, max_iterations: 30")  # fmt: skip
     lines = _run_whole_and_in_parts(parallel, scene, shared_path, 1)
     assert {line["solver"] for line in lines} == {"apgd", "scip"}
 
