@@ -374,8 +374,10 @@ def separation_limit(
     max(r_d, r_c/p), with half of p, since the impulse itself is found to some accuracy only.
     stiffness : their N_tt [1/kg], where they may be lighter than the median contact
     """
-    own = record.v_ref / np.maximum(stiffness, record.v_ref / record.gamma_ref)
-    return np.maximum(R_D, 2 * work * record.v_ref * own / np.asarray(impulse))
+    own = np.full(np.shape(stiffness), record.gamma_ref)
+    np.divide(record.v_ref, stiffness, out=own, where=np.greater(stiffness, 0.0))
+    scale = np.minimum(own, record.gamma_ref)
+    return np.maximum(R_D, 2 * work * record.v_ref * scale / np.asarray(impulse))
 
 
 @case("heavy on light")
