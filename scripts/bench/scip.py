@@ -157,7 +157,7 @@ def pieces(quick: bool) -> list[Piece]:
     if not quick:
         state = "pile-100000/settled"
         for method in ("scip velocity", "scip cg"):
-            brief = (("scip", {"max_iterations": 4}),)
+            brief = (("scip", {"max_iterations": 2}),)
             add("large", state, method, 2, 1e-8, limit=1800, more=brief)
         add("large", state, "apgd cold", 2, 1e-4, limit=1800)
 
