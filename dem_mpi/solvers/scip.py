@@ -58,7 +58,7 @@ _POOR_STEP = 0.05  # below it the direction of plain centring is tried instead
 _TINY_STEP = 1e-4
 # Short steps, while this part of the first residual is left, tell that impulses are far larger than
 # those of the start: begin again, this much higher on the central path.
-_SHORT_STEP, _UNTOUCHED, _HIGHER, _RESTARTS = 0.2, 1e-3, 1e4, 4
+_SHORT_STEP, _UNTOUCHED, _HIGHER, _RESTARTS = 0.2, 0.1, 1e4, 4
 # The proximal term over N_nn. Larger ones keep more digits of the Newton systems in the
 # velocities, and make the way longer where impulses are not unique.
 _PROXIMAL = 1e-10

@@ -134,7 +134,7 @@ def pieces(quick: bool) -> list[Piece]:
         for ranks in (2, 1):
             add("piles", state, "scip velocity", ranks, 1e-8, runs=runs)
             add("piles", state, "apgd cold", ranks, 1e-6, runs=min(runs, 3))
-    add("piles", "pile-2000/settled", "clarabel", 1, 1e-8, runs=3 if quick else 5)
+    add("piles", "pile-2000/settled", "clarabel", 1, 1e-8, runs=3)
 
     if not quick:
         for size in (25_000, 100_000):
