@@ -28,6 +28,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import subprocess
 import sys
 from dataclasses import dataclass, field, replace
@@ -214,15 +215,18 @@ def run_task(task: dict[str, Any], ranks: int, limit: float) -> dict[str, Any]:
     Raises CalledProcessError where it broke off; such a run is no measurement.
     """
     CACHE.mkdir(parents=True, exist_ok=True)
-    order, result = CACHE / "task.json", CACHE / "result.json"
-    result.unlink(missing_ok=True)
+    # Names of its own: another copy of this script may be at work.
+    order, result = (CACHE / f"{name}-{os.getpid()}.json" for name in ("task", "result"))
     order.write_text(json.dumps(task))
     command = [str(Path(__file__).resolve()), "--worker", str(order), str(result)]
     try:
         mpirun(ranks, command, limit)
+        return json.loads(result.read_text())
     except subprocess.TimeoutExpired:
         return {"rows": [], "failure": f"not done after {limit:.0f} s"}
-    return json.loads(result.read_text())
+    finally:
+        order.unlink()
+        result.unlink(missing_ok=True)
 
 
 def gather(
