@@ -1,0 +1,1 @@
+"""Stokes flow around rigid bodies, and the fast sums that it stands on."""
