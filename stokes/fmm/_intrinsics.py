@@ -1,0 +1,71 @@
+"""Instructions for compiled loops over pairs: tuples held in registers, bits of numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+
+@intrinsic
+def load_components(typingctx: Any, rows: Any, column: Any, count: Any) -> Any:
+    """rows[0, column], ..., rows[count - 1, column] of a C-contiguous array as a tuple.
+
+    count must be a constant of the loop's closure. No bounds are checked.
+    """
+    if not isinstance(count, types.IntegerLiteral):
+        return None
+    result = types.UniTuple(rows.dtype, count.literal_value)
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        array = context.make_array(rows)(context, builder, arguments[0])
+        stride = cgutils.unpack_tuple(builder, array.shape)[1]
+        position = context.cast(builder, arguments[1], column, types.intp)
+        loaded = []
+        for _ in range(count.literal_value):
+            loaded.append(builder.load(builder.gep(array.data, [position])))
+            position = builder.add(position, stride)
+        return context.make_tuple(builder, result, loaded)
+
+    return result(rows, column, count), generate
+
+
+@intrinsic
+def add_components(typingctx: Any, a: Any, b: Any) -> Any:
+    """a + b of two tuples of the same length, component by component, in the type of a."""
+    if len(a) != len(b):
+        return None
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        left, right = (cgutils.unpack_tuple(builder, t) for t in arguments)
+        sums = [
+            builder.fadd(x, context.cast(builder, y, from_type, a.dtype))
+            for x, y, from_type in zip(left, right, b.types, strict=True)
+        ]
+        return context.make_tuple(builder, a, sums)
+
+    return a(a, b), generate
+
+
+@intrinsic
+def bits(typingctx: Any, number: Any) -> Any:
+    """The bits of a floating-point number as an integer of the same width."""
+    result = types.int32 if number == types.float32 else types.int64
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], context.get_value_type(result))
+
+    return result(number), generate
+
+
+@intrinsic
+def from_bits(typingctx: Any, integer: Any) -> Any:
+    """The floating-point number that has the bits of an int32 or int64."""
+    result = types.float32 if integer == types.int32 else types.float64
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], context.get_value_type(result))
+
+    return result(integer), generate
