@@ -1,0 +1,252 @@
+"""Compiled walks over the octree. Rows belong to target boxes, entries are source boxes.
+
+Boxes come in the order of their levels, so that a parent's rows are complete before its
+children's are written behind them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dem_mpi._jit import jit
+
+MAX_COLLEAGUES = 27
+MAX_FAR = 8 * MAX_COLLEAGUES
+# A depth-first walk leaves at most 7 boxes waiting on each of 21 levels.
+STACK_SIZE = 8 * 21
+
+
+@jit
+def mark_ancestors(parent, wanted):
+    """Mark, in place, the ancestors of marked boxes."""
+    for b in range(len(parent) - 1, 0, -1):
+        if wanted[b]:
+            wanted[parent[b]] = True
+
+
+@jit
+def same_level(parent, children, leaf, cell, source_count, wanted, smooth, opened):
+    """Pairs of boxes of one level: colleague_start, colleague, far_start, far, vector.
+
+    Colleagues are the source boxes that touch the target box or are it; far ones are the other
+    children of the parent's colleagues. With `smooth`, a touching pair with a leaf in it is far.
+    Sets `opened` of source boxes whose children were looked at.
+    """
+    n = len(parent)
+    colleague_start, colleague = np.zeros(n + 1, np.int64), np.empty(1024, np.int32)
+    far_start, far = np.zeros(n + 1, np.int64), np.empty(1024, np.int32)
+    vector = np.empty(1024, np.int16)
+    near_end, far_end = 0, 0
+    if wanted[0] and source_count[0] > 0:
+        if smooth and leaf[0]:
+            far[0], vector[0] = 0, _vector(cell, 0, 0)
+            far_end = 1
+        else:
+            colleague[0] = 0
+            near_end = 1
+    colleague_start[1], far_start[1] = near_end, far_end
+    for b in range(1, n):
+        if wanted[b]:
+            colleague = _with_room(colleague, near_end, MAX_COLLEAGUES)
+            far = _with_room(far, far_end, MAX_FAR)
+            vector = _with_room(vector, far_end, MAX_FAR)
+            for i in range(colleague_start[parent[b]], colleague_start[parent[b] + 1]):
+                s = colleague[i]
+                if leaf[s]:
+                    continue
+                opened[s] = True
+                for octant in range(8):
+                    c = children[s, octant]
+                    if c < 0 or source_count[c] == 0:
+                        continue
+                    if _touch_same_level(cell, b, c) and not (smooth and (leaf[b] or leaf[c])):
+                        colleague[near_end] = c
+                        near_end += 1
+                    else:
+                        far[far_end], vector[far_end] = c, _vector(cell, b, c)
+                        far_end += 1
+        colleague_start[b + 1], far_start[b + 1] = near_end, far_end
+    return (
+        colleague_start,
+        colleague[:near_end].copy(),
+        far_start,
+        far[:far_end].copy(),
+        vector[:far_end].copy(),
+    )
+
+
+@jit
+def coarser(
+    level, parent, leaf, cell, target_count, wanted, direct_below, colleague_start, colleague
+):
+    """Pairs of a target box and a larger source leaf: near_start, near, local_start, local.
+
+    Near leaves touch the target box, or it has fewer targets than `direct_below`: the leaves
+    under it sum them directly. The others come to its local expansion (X).
+    """
+    n = len(parent)
+    near_start, near = np.zeros(n + 1, np.int64), np.empty(1024, np.int32)
+    local_start, local = np.zeros(n + 1, np.int64), np.empty(1024, np.int32)
+    near_end, local_end = 0, 0
+    for b in range(1, n):
+        near_start[b], local_start[b] = near_end, local_end
+        if not wanted[b]:
+            continue
+        p = parent[b]
+        inherited = near_start[p + 1] - near_start[p]
+        candidates = inherited + colleague_start[p + 1] - colleague_start[p]
+        near = _with_room(near, near_end, candidates)
+        local = _with_room(local, local_end, candidates)
+        for i in range(candidates):
+            if i < inherited:
+                s = near[near_start[p] + i]
+            else:
+                s = colleague[colleague_start[p] + i - inherited]
+                if not leaf[s]:
+                    continue
+            if target_count[b] < direct_below or _touch(level, cell, b, s):
+                near[near_end] = s
+                near_end += 1
+            else:
+                local[local_end] = s
+                local_end += 1
+    near_start[n], local_start[n] = near_end, local_end
+    return near_start, near[:near_end].copy(), local_start, local[:local_end].copy()
+
+
+@jit
+def leaf_rows(
+    level,
+    children,
+    leaf,
+    cell,
+    source_count,
+    wanted,
+    direct_below,
+    colleague_start,
+    colleague,
+    coarse_start,
+    coarse,
+    opened,
+):
+    """Pairs of a target leaf: near_start, near, target_start, target.
+
+    Near (U) are the `coarse` leaves and, among the colleagues and all under them, the leaves that
+    touch the target leaf. A box under a colleague that does not touch it comes by its multipole
+    (W), or its leaves do directly where it has fewer sources than `direct_below`.
+    """
+    n = len(level)
+    near_start, near = np.zeros(n + 1, np.int64), np.empty(1024, np.int32)
+    target_start, target = np.zeros(n + 1, np.int64), np.empty(1024, np.int32)
+    near_end, target_end = 0, 0
+    stack = np.empty(STACK_SIZE, np.int32)
+    for b in range(n):
+        near_start[b], target_start[b] = near_end, target_end
+        if not (wanted[b] and leaf[b]):
+            continue
+        near = _with_room(near, near_end, coarse_start[b + 1] - coarse_start[b])
+        for i in range(coarse_start[b], coarse_start[b + 1]):
+            near[near_end] = coarse[i]
+            near_end += 1
+        for i in range(colleague_start[b], colleague_start[b + 1]):
+            stack[0] = colleague[i]
+            waiting = 1
+            while waiting > 0:
+                waiting -= 1
+                s = stack[waiting]
+                direct = source_count[s] < direct_below or _touch(level, cell, s, b)
+                if not direct:
+                    target = _with_room(target, target_end, 1)
+                    target[target_end] = s
+                    target_end += 1
+                elif leaf[s]:
+                    near = _with_room(near, near_end, 1)
+                    near[near_end] = s
+                    near_end += 1
+                else:
+                    opened[s] = True
+                    for octant in range(7, -1, -1):
+                        c = children[s, octant]
+                        if c >= 0 and source_count[c] > 0:
+                            stack[waiting] = c
+                            waiting += 1
+    near_start[n], target_start[n] = near_end, target_end
+    return near_start, near[:near_end].copy(), target_start, target[:target_end].copy()
+
+
+@jit
+def missing_children(opened, children, source_count):
+    """The first opened box whose children do not hold all of its sources, or -1."""
+    for b in range(len(opened)):
+        if opened[b]:
+            held = 0
+            for octant in range(8):
+                if children[b, octant] >= 0:
+                    held += source_count[children[b, octant]]
+            if held != source_count[b]:
+                return b
+    return -1
+
+
+@jit
+def merged_ranges(row, start, entry, ranges):
+    """Ranges of points of the entries of some rows, sorted, those that meet made one.
+
+    Returns start (len(row) + 1,) and ranges (m, 2).
+    """
+    total = 0
+    for b in row:
+        total += start[b + 1] - start[b]
+    merged_start = np.zeros(len(row) + 1, np.int64)
+    merged = np.empty((total, 2), np.int32)
+    end = 0
+    for k in range(len(row)):
+        entries = entry[start[row[k]] : start[row[k] + 1]]
+        for i in np.argsort(ranges[entries, 0]):
+            first, last = ranges[entries[i]]
+            if end > merged_start[k] and merged[end - 1, 1] == first:
+                merged[end - 1, 1] = last
+            else:
+                merged[end, 0], merged[end, 1] = first, last
+                end += 1
+        merged_start[k + 1] = end
+    return merged_start, merged[:end].copy()
+
+
+@jit
+def _touch_same_level(cell, a, b):
+    x = abs(cell[a, 0] - cell[b, 0])
+    y = abs(cell[a, 1] - cell[b, 1])
+    z = abs(cell[a, 2] - cell[b, 2])
+    return max(x, y, z) <= 1
+
+
+@jit
+def _touch(level, cell, fine, coarse):
+    """Whether a box touches, or lies in, one of the same or a coarser level."""
+    shift = level[fine] - level[coarse]
+    for axis in range(3):
+        first = cell[coarse, axis] << shift
+        last = first + (1 << shift) - 1
+        if cell[fine, axis] < first - 1 or cell[fine, axis] > last + 1:
+            return False
+    return True
+
+
+@jit
+def _vector(cell, target, source):
+    """Number of the transfer vector, lattice coordinates of the target less the source's."""
+    x = cell[target, 0] - cell[source, 0] + 3
+    y = cell[target, 1] - cell[source, 1] + 3
+    z = cell[target, 2] - cell[source, 2] + 3
+    return (x * 7 + y) * 7 + z
+
+
+@jit
+def _with_room(array, used, extra):
+    """The array itself, or a longer copy, with room for `extra` more entries behind `used`."""
+    if used + extra <= len(array):
+        return array
+    longer = np.empty(max(2 * len(array), used + extra), array.dtype)
+    longer[:used] = array[:used]
+    return longer
