@@ -83,6 +83,7 @@ class StepRecord:
     factor_entries: int
     linear_residual: float
     refinements: int
+    linear_iterations: int
     converged: bool
     reason: str
     r_p: float
@@ -123,6 +124,7 @@ class _Effort:
     factorisations: int = 0
     outer: int = 0
     refinements: int = 0
+    linear_iterations: int = 0
     linear_residual: float = 0.0
 
     def add(self, report: SolveReport) -> None:
@@ -133,6 +135,7 @@ class _Effort:
         self.factorisations += report.factorisations
         self.outer += report.outer
         self.refinements += report.refinements
+        self.linear_iterations += report.linear_iterations
         self.linear_residual = max(self.linear_residual, report.linear_residual)
 
 
@@ -722,6 +725,7 @@ class Simulation:
             factor_entries=last.report.factor_entries,
             linear_residual=effort.linear_residual,
             refinements=effort.refinements,
+            linear_iterations=effort.linear_iterations,
             converged=not missed,
             reason=missed[0] if missed else "converged",
             r_p=max(r.primal for r in residuals),

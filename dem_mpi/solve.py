@@ -322,6 +322,8 @@ def _report_lines(
             f"factorisations{entries}, residual <= {report.linear_residual:.1e} after "
             f"{report.refinements} refinements"
         )
+        if report.linear_iterations:
+            lines.append(f"  conj. gradients  {report.linear_iterations} iterations in all")
     return lines
 
 

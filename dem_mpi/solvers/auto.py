@@ -225,6 +225,7 @@ def joined(problem: ConeProblem, tolerance: Tolerance, parts: list[SolveReport])
         factor_entries=newton.factor_entries,
         linear_residual=newton.linear_residual,
         refinements=newton.refinements,
+        linear_iterations=newton.linear_iterations,
     )
 
 

@@ -21,9 +21,10 @@ class SolveReport:
     lipschitz: last step-size constant of APGD, a starting value for the next problem of its kind
     solver   : the method that made the impulse, "apgd" or "scip"
     outer    : cone problems solved in turn; more than one only under Coulomb's law
-    form, factor_entries, linear_residual, refinements : of the Newton systems, where there are any:
-               the unknowns chosen ("velocity" or "contact"), non-zeros of the factor, the worst
-               relative residual, and the refinement steps spent to reach it
+    form, factor_entries, linear_residual, refinements, linear_iterations : of the Newton systems,
+               where there are any: the unknowns chosen ("velocity" or "contact"), non-zeros of the
+               factor, the worst relative residual, the refinement steps spent to reach it, and the
+               iterations of conjugate gradients, 0 for a direct solver
     """
 
     impulse: NDArray
@@ -43,6 +44,7 @@ class SolveReport:
     factor_entries: int = 0
     linear_residual: float = 0.0
     refinements: int = 0
+    linear_iterations: int = 0
 
 
 class Solver(Protocol):

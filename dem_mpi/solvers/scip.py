@@ -280,6 +280,7 @@ class _Run:
         self.last_merit = math.inf
         self.history: list[tuple[float, ...]] = []
         self.iterations = self.products = self.factorisations = self.refinements = 0
+        self.linear_iterations = 0
         self.linear_residual = 0.0
         self.seconds = {"solve": 0.0, "assemble": 0.0, "factor": 0.0, "substitute": 0.0}
 
@@ -336,6 +337,7 @@ class _Run:
         with self.timed("substitute"):
             done = system.solve(s, out, tolerance)
         self.refinements += done.refinements
+        self.linear_iterations += done.iterations
         self.products += done.products
         return done.residual
 
@@ -364,6 +366,7 @@ class _Run:
             factor_entries=used.factor_entries if used else 0,
             linear_residual=self.linear_residual,
             refinements=self.refinements,
+            linear_iterations=self.linear_iterations,
         )
 
 

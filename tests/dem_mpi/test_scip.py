@@ -654,6 +654,15 @@ def test_heap_meets_its_tolerance_by_a_fresh_product(parallel, mu):
     assert np.all(dual <= 1e-10 * problem.velocity_scale)
     assert np.all(work <= 1e-10 * problem.velocity_scale * problem.impulse_scale)
     assert report.linear_residual <= 1e-8
+    assert report.linear_iterations == 0  # factorised
+
+
+@ranks_1_2_3
+def test_iterations_of_conjugate_gradients_are_counted(parallel):
+    newton = NewtonOptions(form="velocity", linear="cg")
+    report = solve(heap(parallel), system=NewtonSystem, newton=newton)
+    assert report.converged, report.reason
+    assert report.linear_iterations >= report.factorisations > 0
 
 
 @ranks_1_2_3
