@@ -1,0 +1,495 @@
+"""Multipole to local transfers on equispaced grids, as products in Fourier space.
+
+Between the grids of two boxes the kernel depends on differences of nodes only: the transfer is a
+Toeplitz matrix in each direction, part of a circulant one of 2 l - 1, l nodes per direction, which
+Fourier transforms make diagonal (P. Blanchard, PhD thesis, Université de Bordeaux 2017, sec. 5.1):
+
+    L_t = F^-1 sum over s of K_v(s,t) F M_s,    one transform for each multipole and each local.
+
+Three things make it fast. The lengths are small, so that products with small real matrices of
+cosines and sines, which skip padding and what is thrown away, take the place of fast transforms.
+Half of the spectrum is kept, exactly (l-1) (4 l^2 - 2 l + 1) + l ... of (2 l - 1)^3 numbers, and it
+is worked through in blocks of one vector register, whose tables stay in the cache. And where most
+boxes have all their siblings, 27 products stand for the 64 between two families of children.
+
+K_-v = parity conj(K_v) halves the tables of even and odd kernels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from stokes.fmm import _kernels_transfer as kernels
+from stokes.fmm.kernels import Kernel
+
+_VECTORS = 343
+# Below the coarsest level of a standard tree with two boxes apart enough (4 boxes per edge).
+_FIRST_FAR_LEVEL = 2
+# Cost of a product in the loop over pairs against one in the loop over families.
+_PAIR_COST = 1.6
+# Memory for the spectra of a part of the frequencies.
+_SPECTRA_BYTES = 1 << 28
+
+
+class Nodes(Protocol):
+    """What is used of a grid: its kind and nodes per direction."""
+
+    kind: str
+    nodes: int
+
+
+class FourierTransfer:
+    """The transfer of a kernel between the boxes of a level.
+
+    kernel        homogeneous kernels have one table, others one a level
+    grid          an equispaced grid with the nodes at the corners of the box among its nodes
+    edges         (levels,) edge of a box at each level, root first
+    admissibility "standard", or "smooth": boxes of the last level reach their neighbours too
+    dtype         of tables, multipoles and locals
+    memory        bytes of spectra held at a time; more frequencies are done in turns
+    """
+
+    def __init__(
+        self,
+        kernel: Kernel,
+        grid: Nodes,
+        edges: Sequence[float],
+        *,
+        admissibility: str = "standard",
+        dtype: DTypeLike = np.float64,
+        threads: int = 1,
+        memory: int = _SPECTRA_BYTES,
+    ) -> None:
+        if admissibility not in ("standard", "smooth"):
+            raise ValueError(f"admissibility = {admissibility!r}: must be standard or smooth")
+        if grid.kind != "equispaced":
+            raise ValueError(f"grid {grid.kind!r}: Fourier transfers need an equispaced grid")
+        if grid.nodes < 2:
+            raise ValueError(f"nodes = {grid.nodes}: must be >= 2")
+        self.kernel = kernel
+        self.nodes = grid.nodes
+        self.dtype = np.dtype(dtype)
+        self.threads = threads
+        self._memory = memory
+        self._lanes = kernels.VECTOR_BYTES // self.dtype.itemsize
+        self._edges = np.asarray(edges, dtype=np.float64)
+        self._smooth = admissibility == "smooth"
+        self._frequencies = _Frequencies(self.nodes, self._lanes, self.dtype)
+        self._stored = _stored_vectors(self._smooth, kernel.parity != 0)
+        self._tables = {
+            level: self._build(edge)
+            for level, edge in _levels_with_tables(kernel, self._edges, self._smooth)
+        }
+        number = np.asarray(kernel.entry, dtype=np.int64).reshape(-1)
+        self._entry = number * 2 * self._lanes
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the tables."""
+        return sum(table.nbytes for table in self._tables.values())
+
+    def add(
+        self,
+        level: int,
+        multipoles: NDArray,
+        start: NDArray,
+        source: NDArray,
+        vector: NDArray,
+        targets: NDArray,
+        local: NDArray,
+        cells: NDArray | None = None,
+    ) -> None:
+        """Add to the locals of target boxes what their source boxes of one level give.
+
+        multipoles : (boxes, n_in, nodes, nodes, nodes); local : (boxes, n_out, ...), added to
+        start : (k + 1,) pairs start[t] : start[t + 1] belong to the box targets[t]
+        source, vector : (pairs,) box of the source, transfer vector 0..342
+        cells : (boxes, 3) coordinates of the boxes in the lattice of the level; without them
+            each pair is taken by itself, which is slower where most boxes have their siblings
+        """
+        self.apply(self.prepare(level, start, source, vector, targets, cells), multipoles, local)
+
+    def prepare(
+        self,
+        level: int,
+        start: NDArray,
+        source: NDArray,
+        vector: NDArray,
+        targets: NDArray,
+        cells: NDArray | None = None,
+    ) -> Pairs:
+        """Order the pairs of a level (arguments of `add`) for any number of calls of `apply`."""
+        start = np.asarray(start, dtype=np.int64)
+        busy = np.flatnonzero(np.diff(start) > 0)
+        targets = np.asarray(targets)[busy]
+        sources, place = np.unique(np.asarray(source[start[0] : start[-1]]), return_inverse=True)
+        vector = np.asarray(vector[start[0] : start[-1]], dtype=np.int64)
+        bounds = np.append(start[busy], start[-1]) - start[0]
+        pairs = Pairs(level, sources, targets, bounds, place.reshape(-1), vector, None)
+        if cells is None or len(targets) == 0:
+            return pairs
+        families = _families(pairs, np.asarray(cells, dtype=np.int64))
+        if families is None or families.products >= _PAIR_COST * len(vector):
+            return pairs
+        return Pairs(level, sources, targets, bounds, pairs.place, vector, families)
+
+    def apply(self, pairs: Pairs, multipoles: NDArray, local: NDArray) -> None:
+        """Add to the locals what the prepared pairs of a level give: see `add`."""
+        if len(pairs.targets) == 0:
+            return
+        if multipoles.dtype != self.dtype or local.dtype != self.dtype:
+            raise TypeError(f"multipoles and locals must be {self.dtype}")
+        if not (multipoles.flags.c_contiguous and local.flags.c_contiguous):
+            raise ValueError("multipoles and locals must be contiguous in C order")
+        table, scale = self._table(pairs.level)
+        spectra = _Rows(pairs.sources, self.kernel.n_in, self.nodes**3, self._lanes)
+        result = _Rows(pairs.targets, self.kernel.n_out, self.nodes**3, self._lanes)
+        per_block = (spectra.total + result.total) * 2 * kernels.VECTOR_BYTES
+        blocks = max(1, min(self._memory // per_block, self._frequencies.blocks))
+        M = _aligned(blocks * spectra.total * 2 * self._lanes, self.dtype)
+        L = _aligned(blocks * result.total * 2 * self._lanes, self.dtype)
+        for first in range(0, self._frequencies.blocks, blocks):
+            last = min(first + blocks, self._frequencies.blocks)
+            some = _Part(self._frequencies, first, last, self.nodes, self._lanes, self.dtype)
+            some.forward(multipoles, spectra, M, self.threads)
+            self._translate(pairs, table, first, last, M, spectra, L, result)
+            some.backward(L, result, scale, local, self.threads)
+
+    def _translate(self, pairs, table, first, last, M, spectra, L, result):
+        lanes, kernel = self._lanes, self.kernel
+        size = kernel.n_unique * 2 * lanes
+        stride = table.size // self._frequencies.blocks
+        workers = max(1, min(self.threads, last - first))
+        common = (table[first * stride :], stride, size, lanes, self._stored, self._parity)
+        M_stride, L_stride = spectra.total * 2 * lanes, result.total * 2 * lanes
+        families = pairs.families
+        if families is None:
+            full = _aligned_rows(workers, _VECTORS * size, self.dtype)
+            steps = np.stack([pairs.vector * size, pairs.place * kernel.n_in * 2 * lanes], 1)
+            kernels.translate_pairs.using(self.threads)(
+                *common, full, last - first, M, M_stride, steps.reshape(-1), pairs.start,
+                self._entry, kernel.n_in, kernel.n_out, L, L_stride,
+            )  # fmt: skip
+            return
+        parents = len(families.source_children)
+        in_size = kernel.n_in * 2 * lanes
+        sizes = [
+            _VECTORS * size,
+            27 * size,
+            27 * len(families.directions) * size,
+            (parents + 1) * in_size,
+            kernels.GROUP * kernel.n_out * 2 * lanes,
+        ]
+        places = np.concatenate([[0], np.cumsum(sizes)])
+        work = _aligned_rows(workers, places[-1], self.dtype)
+        steps = families.steps * np.array([size] + kernels.GROUP * [in_size])
+        stored = self._stored if families.neighbours else np.where(_NEAR, -1000, self._stored)
+        common = (*common[:4], stored, self._parity)
+        kernels.translate_families.using(self.threads)(
+            *common, families.directions, work, last - first, M, M_stride,
+            families.source_children, steps.reshape(-1), families.start, self._entry,
+            kernel.n_in, kernel.n_out, L, L_stride, families.target_children, places,
+        )  # fmt: skip
+
+    @property
+    def _parity(self) -> float:
+        return self.dtype.type(self.kernel.parity)
+
+    def _table(self, level: int) -> tuple[NDArray, float]:
+        if self.kernel.degree is None:
+            return self._tables[level], self.dtype.type(1.0)
+        return self._tables[0], self.dtype.type(self._edges[level] ** self.kernel.degree)
+
+    def _build(self, edge: float) -> NDArray:
+        """Spectra of the kernel for the stored vectors: [block][vector][component][re, im]."""
+        values = _windows(self.kernel, self.nodes, edge, self._stored).astype(self.dtype)
+        n = 2 * self.nodes - 1
+        rows = _Rows(np.arange(len(values)), 1, n**3, self._lanes, exact=True)
+        part = _Part(self._frequencies, 0, self._frequencies.blocks, n, self._lanes, self.dtype)
+        table = _aligned(self._frequencies.blocks * rows.total * 2 * self._lanes, self.dtype)
+        part.forward(values, rows, table, self.threads)
+        shaped = table.reshape(self._frequencies.blocks, -1, self._lanes)
+        shaped *= self._frequencies.weight.reshape(-1, 1, self._lanes)
+        return table
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Pairs of one level in the order of the loops over them.
+
+    sources, targets : boxes that occur; start, place, vector : the pairs of each target by the
+    place of the source in `sources`; families : the same by families of siblings, where it pays
+    """
+
+    level: int
+    sources: NDArray
+    targets: NDArray
+    start: NDArray
+    place: NDArray
+    vector: NDArray
+    families: _Families | None
+
+
+@dataclass(frozen=True)
+class _Families:
+    """Pairs of parents, GROUP targets at a time.
+
+    steps (rows, 1 + GROUP): direction, then source parent of each target; the number of parents
+    stands for none. products: those of a frequency and an entry, for the choice.
+    """
+
+    directions: NDArray
+    neighbours: bool
+    source_children: NDArray
+    target_children: NDArray
+    steps: NDArray
+    start: NDArray
+    products: int
+
+
+_OFFSETS = np.stack(np.meshgrid(*3 * [np.arange(-3, 4)], indexing="ij"), -1).reshape(-1, 3)
+_NEAR = np.abs(_OFFSETS).max(axis=1) <= 1
+
+
+def _families(pairs: Pairs, cells: NDArray) -> _Families | None:
+    """Group pairs by parents; None if they are not all there are between their families."""
+    neighbours = bool(_NEAR[pairs.vector].any())
+    offsets = np.stack(np.meshgrid(*3 * [np.arange(-1, 2)], indexing="ij"), -1).reshape(-1, 3)
+    directions = offsets if neighbours else offsets[np.any(offsets != 0, axis=1)]
+    sources, targets = cells[pairs.sources], cells[pairs.targets]
+    lowest = np.minimum(sources.min(axis=0), targets.min(axis=0)) >> 1
+    source_parent, source_children = _parents(sources, lowest)
+    target_parent, target_children = _parents(targets, lowest)
+    order = np.argsort(source_parent)
+    wanted = target_parent[:, None] - _code(directions)
+    place = np.searchsorted(source_parent[order], wanted)
+    place = order[np.minimum(place, len(order) - 1)]
+    none = len(source_parent)
+    neighbour = np.where(source_parent[place] == wanted, place, none)
+    if _count(source_children, target_children, neighbour, directions, neighbours) != len(
+        pairs.vector
+    ):
+        return None
+    padding = -len(target_parent) % kernels.GROUP
+    neighbour = np.pad(neighbour, ((0, padding), (0, 0)), constant_values=none)
+    target_children = np.pad(target_children, ((0, padding), (0, 0)), constant_values=-1)
+    grouped = neighbour.reshape(-1, kernels.GROUP, len(directions))
+    group, direction = np.nonzero((grouped != none).any(axis=1))
+    steps = np.concatenate([direction[:, None], grouped[group, :, direction]], axis=1)
+    start = np.searchsorted(group, np.arange(len(grouped) + 1))
+    products = 27 * kernels.GROUP * len(steps)
+    return _Families(
+        directions, neighbours, source_children, target_children, steps, start, products
+    )
+
+
+def _code(cells: NDArray) -> NDArray:
+    """One number for the three coordinates; codes of differences are differences of codes."""
+    return (cells[:, 0] * (1 << 42)) + (cells[:, 1] * (1 << 21)) + cells[:, 2]
+
+
+def _parents(cells: NDArray, lowest: NDArray) -> tuple[NDArray, NDArray]:
+    """Codes of the parents in the order of the boxes, and their children (parents, 8) or -1."""
+    codes, first, place = np.unique(
+        _code((cells >> 1) - lowest + 1), return_index=True, return_inverse=True
+    )
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    children = np.full((len(codes), 8), -1, dtype=np.int64)
+    octant = (cells & 1) @ np.array([4, 2, 1])
+    children[rank[place.reshape(-1)], octant] = np.arange(len(cells))
+    return codes[order], children
+
+
+def _count(source_children, target_children, neighbour, directions, neighbours) -> int:
+    """Pairs of children far enough apart, or of all of them."""
+    bits = np.array([[o >> 2 & 1, o >> 1 & 1, o & 1] for o in range(8)])
+    d = 2 * directions[:, None, None] + bits[:, None] - bits
+    far = np.ones(d.shape[:-1], dtype=bool) if neighbours else np.abs(d).max(axis=-1) > 1
+    here = np.pad(source_children >= 0, ((0, 1), (0, 0)))
+    total = 0
+    for k in range(len(directions)):
+        total += int(((target_children >= 0) @ (far[k].astype(int)) * here[neighbour[:, k]]).sum())
+    return total
+
+
+def _levels_with_tables(kernel: Kernel, edges: NDArray, smooth: bool):
+    """(level, edge) of the tables: one of a unit box for homogeneous kernels."""
+    last = len(edges) - 1
+    first = min(_FIRST_FAR_LEVEL, last) if smooth else _FIRST_FAR_LEVEL
+    if last < first:
+        return
+    if kernel.degree is not None:
+        yield 0, 1.0
+        return
+    for level in range(first, last + 1):
+        yield level, edges[level]
+
+
+def _stored_vectors(smooth: bool, mirrored: bool) -> NDArray:
+    """Number of each vector's table; -1 - number where it is the mirrored one's; -1000 if none."""
+    stored = np.full(_VECTORS, -1000, dtype=np.int64)
+    count = 0
+    for v in range(_VECTORS):
+        if _NEAR[v] and not smooth:
+            continue
+        opposite = _VECTORS - 1 - v
+        if mirrored and opposite < v:
+            stored[v] = -1 - stored[opposite]
+        else:
+            stored[v] = count
+            count += 1
+    return stored
+
+
+def _windows(kernel: Kernel, nodes: int, edge: float, stored: NDArray) -> NDArray:
+    """Kernel at the differences of nodes for each stored vector: (vectors n_unique, n, n, n)."""
+    n, step = 2 * nodes - 1, nodes - 1
+    x = np.arange(-4 * step, 4 * step + 1) * (edge / step)
+    lattice = np.empty((kernel.n_unique, *3 * [len(x)]))
+    plane = np.stack(np.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
+    for i, first in enumerate(x):
+        r = np.concatenate([np.full((len(plane), 1), first), plane], axis=1)
+        lattice[:, i] = kernel.unique(r).T.reshape(-1, len(x), len(x))
+    vectors = np.flatnonzero(stored >= 0)
+    values = np.empty((len(vectors), kernel.n_unique, n, n, n))
+    for k, v in enumerate(vectors):
+        a, b, c = (_OFFSETS[v] + 3) * step
+        values[k] = lattice[:, a : a + n, b : b + n, c : c + n]
+    return values.reshape(-1, n, n, n)
+
+
+class _Frequencies:
+    """The half of the frequencies of a real grid that says all, kz by kz, in whole blocks.
+
+    Frequencies are (kx, ky, kz) with |kx|, |ky| < l and 0 <= kz < l; of kz = 0 those with kx > 0,
+    or kx = 0 and ky >= 0.
+    """
+
+    def __init__(self, nodes: int, lanes: int, dtype: np.dtype) -> None:
+        self.nodes = nodes
+        number, weight, count = -np.ones((2 * nodes - 1, 2 * nodes - 1, nodes), np.int64), [], 0
+        for kz in range(nodes):
+            kx, ky = np.meshgrid(*2 * [np.arange(1 - nodes, nodes)], indexing="ij")
+            kept = (kz > 0) | (kx > 0) | ((kx == 0) & (ky >= 0))
+            number[kept, kz] = count + np.arange(kept.sum())
+            zero = (kx[kept] == 0) & (ky[kept] == 0) & (kz == 0)
+            weight.append(np.where(zero, 1.0, 2.0))
+            count += int(kept.sum())
+        self.number = number
+        self.blocks = -(-count // lanes)
+        padded = np.zeros(self.blocks * lanes)
+        padded[:count] = np.concatenate(weight) / (2 * nodes - 1) ** 3
+        self.weight = padded.astype(dtype)
+        self.last = number.max(axis=(0, 1))
+
+
+class _Part:
+    """Transforms between grids of some size and a range of the blocks of frequencies."""
+
+    def __init__(
+        self, frequencies: _Frequencies, first: int, last: int, size: int, lanes: int, dtype
+    ) -> None:
+        nodes = frequencies.nodes
+        n = 2 * nodes - 1
+        self._size, self._lanes, self._blocks, self._dtype = size, lanes, last - first, dtype
+        low, high = first * lanes, last * lanes
+        k0 = int(np.searchsorted(frequencies.last, low))
+        k1 = min(int(np.searchsorted(frequencies.last, high - 1)) + 1, nodes)
+        # Grids of n are the kernel's: differences of nodes about zero.
+        x = np.arange(size) - (nodes - 1 if size == n else 0)
+        angle = 2.0 * np.pi / n * np.outer(np.arange(nodes), x)
+        cos, sin = np.cos(angle), np.sin(angle)
+        self._matrix_z = np.concatenate([cos[k0:k1], sin[k0:k1]]).astype(dtype)
+        self._matrix = np.concatenate([cos, sin[1:]]).astype(dtype)
+        n_z = 2 * (k1 - k0)
+        b = size * size * max(size, n_z) * lanes
+        c = b + size * n * n_z * lanes
+        d = c + n * n * n_z * lanes
+        zero = d + max(size * size * n_z, 2 * self._blocks * lanes) * lanes
+        trash = zero + 2 * lanes
+        self._places = np.array([b, c, d, zero])
+        self._work = trash + 2 * lanes
+        self._offsets(frequencies, k0, k1, low, high, trash)
+
+    def _offsets(self, frequencies, k0, k1, low, high, trash) -> None:
+        nodes, lanes = frequencies.nodes, self._lanes
+        n, n_z = 2 * nodes - 1, 2 * (k1 - k0)
+        _, c, d, zero = self._places
+        shape = (k1 - k0, nodes, nodes)
+        kz, ky, kx = (k.reshape(-1) for k in np.indices(shape))
+        real = np.empty((len(kz), 8), dtype=np.int64)
+        for i in range(8):
+            X, Y, Z = i >> 2, i >> 1 & 1, i & 1
+            x, y, z = kx + X * (nodes - 1), ky + Y * (nodes - 1), kz + Z * (k1 - k0)
+            missing = (X & (kx == 0)) | (Y & (ky == 0))
+            real[:, i] = np.where(missing, -1, c + ((x * n + y) * n_z + z) * lanes)
+        complex_ = np.empty((len(kz), 4), dtype=np.int64)
+        for i, (sx, sy) in enumerate([(1, 1), (1, -1), (-1, 1), (-1, -1)]):
+            f = frequencies.number[sx * kx + nodes - 1, sy * ky + nodes - 1, kz + k0]
+            twice = ((sx < 0) & (kx == 0)) | ((sy < 0) & (ky == 0))
+            missing = twice | (f < low) | (f >= high)
+            complex_[:, i] = np.where(missing, -1, d + 2 * (f - low) * lanes)
+        self._read_real = np.where(real < 0, zero, real).reshape(-1)
+        self._write_real = np.where(real < 0, trash, real).reshape(-1)
+        self._read_complex = np.where(complex_ < 0, zero, complex_).reshape(-1)
+        self._write_complex = np.where(complex_ < 0, trash, complex_).reshape(-1)
+
+    def forward(self, values: NDArray, rows: _Rows, spectra: NDArray, threads: int) -> None:
+        """Spectra of the rows of values; those of the box after the last are zero."""
+        work = _aligned_rows(threads, self._work, self._dtype)
+        kernels.forward.using(threads)(
+            values.reshape(-1), rows.offsets, self._matrix_z, self._matrix, self._size,
+            self._read_real, self._write_complex, self._places, work, self._lanes, self._blocks,
+            spectra, rows.total,
+        )  # fmt: skip
+
+    def backward(
+        self, spectra: NDArray, rows: _Rows, scale: float, values: NDArray, threads: int
+    ) -> None:
+        """Add the inverse transform, times scale, to the rows of values."""
+        work = _aligned_rows(threads, self._work, self._dtype)
+        kernels.backward.using(threads)(
+            spectra, rows.total, np.ascontiguousarray(self._matrix_z.T),
+            np.ascontiguousarray(self._matrix.T), self._size, self._write_real,
+            self._read_complex, self._places, work, self._lanes, self._blocks, scale,
+            rows.offsets, rows.used, values.reshape(-1),
+        )  # fmt: skip
+
+
+class _Rows:
+    """Rows of components of boxes: a vector's lanes at a time, the last one filled up.
+
+    offsets : of each row in an array (boxes, components, length)
+    """
+
+    def __init__(
+        self, boxes: NDArray, components: int, length: int, lanes: int, exact: bool = False
+    ) -> None:
+        number = np.asarray(boxes, dtype=np.int64)[:, None] * components + np.arange(components)
+        offsets = number.reshape(-1) * length
+        self.used = len(offsets)
+        self.offsets = np.pad(offsets, (0, -len(offsets) % lanes), mode="edge")
+        self.total = len(self.offsets)
+
+
+def _aligned(count: int, dtype: np.dtype) -> NDArray:
+    """Zeros that begin at a cache line, so that no vector lies across two."""
+    itemsize = np.dtype(dtype).itemsize
+    spare = kernels.VECTOR_BYTES // itemsize
+    array = np.zeros(count + spare, dtype)
+    shift = -array.ctypes.data % kernels.VECTOR_BYTES // itemsize
+    return array[shift : shift + count]
+
+
+def _aligned_rows(rows: int, count: int, dtype: np.dtype) -> NDArray:
+    """Array (rows, count) whose rows begin at cache lines, rounded up to whole ones."""
+    spare = kernels.VECTOR_BYTES // np.dtype(dtype).itemsize
+    count += -count % spare
+    return _aligned(rows * count, dtype).reshape(rows, count)
