@@ -1,0 +1,114 @@
+"""What a user may ask of the fast sum, and what it says about itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Literal, get_args, get_type_hints
+
+Method = Literal["auto", "ufmm", "bbfmm", "symmetric"]
+Precision = Literal["auto", "double", "single"]
+Derivative = Literal["auto", "exact", "interpolated"]
+Admissibility = Literal["auto", "standard", "smooth"]
+Near = Literal["auto", "cached", "recomputed"]
+Backend = Literal["own", "fmm3d", "direct"]
+
+
+@dataclass(frozen=True)
+class FmmOptions:
+    """Overrides of what `Fmm` would choose from the asked error.
+
+    method        : "ufmm" equispaced grids with transfers in Fourier space; "bbfmm" Chebyshev grids
+                    with globally compressed transfers; "symmetric" Chebyshev grids with the 16
+                    operators that the symmetries of the cube leave, each of low rank
+    order         : p of the interpolation; a grid has p + 1 nodes a direction
+    leaf_size     : most points of one kind (sources or targets) in a leaf
+    depth         : a uniform tree instead: its leaves are the occupied boxes of this level
+    precision     : of the far field and, in single, of the near field's pairs
+    derivative    : a kernel that is a gradient of another: "exact" transfers the gradient itself,
+                    "interpolated" transfers the other kernel and differentiates the interpolation
+    admissibility : "smooth" transfers between touching leaves too: no near field. Only for
+                    kernels smooth at the origin; "auto" takes "standard" unless `depth` is given
+    near          : "cached" stores the near field's matrices for later applications
+    threads       : of this rank
+    """
+
+    method: Method = "auto"
+    order: int | None = None
+    leaf_size: int | None = None
+    depth: int | None = None
+    precision: Precision = "auto"
+    derivative: Derivative = "auto"
+    admissibility: Admissibility = "auto"
+    near: Near = "auto"
+    backend: Backend = "own"
+    threads: int = 1
+
+    def __post_init__(self) -> None:
+        """Raise ValueError, with the option's name, for a value outside its rule."""
+        hints = get_type_hints(type(self))
+        for item in fields(self):
+            allowed = get_args(hints[item.name])
+            value = getattr(self, item.name)
+            if all(isinstance(choice, str) for choice in allowed) and allowed:
+                if value not in allowed:
+                    raise ValueError(f"{item.name} = {value!r}: must be one of {allowed}")
+        for name, least in (("order", 1), ("leaf_size", 1), ("depth", 0), ("threads", 1)):
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"{name} = {value}: must be >= {least}")
+        if self.order is not None and self.order > MAX_ORDER:
+            raise ValueError(f"order = {self.order}: must be <= {MAX_ORDER}")
+        if self.leaf_size is not None and self.depth is not None:
+            raise ValueError("leaf_size and depth exclude each other: give one of them")
+
+
+MAX_ORDER = 31
+
+
+@dataclass(frozen=True)
+class FmmReport:
+    """What a plan is made of, on this rank unless said otherwise.
+
+    method          : "ufmm", "bbfmm", "symmetric", "direct" or "fmm3d"; why: one sentence
+    nodes           : of a grid in one direction, order + 1
+    expected_error  : relative 2-norm that the error model expects, of the whole sum
+    leaf_size, depth: of the tree; depth is the level of the deepest leaf
+    boxes           : on this rank, those of other ranks' points included
+    pairs           : by list: point pairs of "near", node-point pairs of "multipole_to_target" and
+                      "source_to_local", box pairs of "far"
+    memory          : bytes by part
+    plan_seconds    : by phase, without compilation
+    compile_seconds : spent on compiling kernels, or on loading them from disk, while planning
+    """
+
+    method: str
+    why: str
+    kernel: str
+    nodes: int
+    precision: str
+    derivative: str
+    admissibility: str
+    near: str
+    expected_error: float
+    leaf_size: int | None
+    depth: int
+    boxes: int
+    pairs: Mapping[str, int]
+    memory: Mapping[str, int]
+    plan_seconds: Mapping[str, float]
+    compile_seconds: float
+
+
+@dataclass(frozen=True)
+class ErrorEstimate:
+    """Error of a sum on sampled targets against direct summation.
+
+    relative_l2  : ||u - u_direct||_2 / ||u_direct||_2 over all sampled targets and components
+    relative_max : largest |u - u_direct| / largest |u_direct|
+    samples      : targets sampled, on all ranks
+    """
+
+    relative_l2: float
+    relative_max: float
+    samples: int

@@ -1,0 +1,286 @@
+"""The sum by a tree: points to grids, grids to grids, grids to points, and the near field.
+
+phi_i = sum_j k(x_i - y_j) w_j by interpolation of the kernel (P. Blanchard, PhD thesis, Université
+de Bordeaux 2017, ch. 1):
+
+    k(x, y) ~ sum_a S_a(x) sum_b k(x_a, y_b) S_b(y)
+
+for points x, y in two boxes that do not touch, with nodes x_a, y_b of their grids. All of it in
+internal coordinates: the unit of length is the root cube's edge for a homogeneous kernel, the
+kernel's own length for others, so that neither a grid nor a table knows the size of the cloud.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dem_mpi.parallel import Parallel
+from stokes.fmm.chebyshev import CompressedTransfer, SymmetricTransfer
+from stokes.fmm.distribution import Distribution
+from stokes.fmm.interpolation import Grid, Interpolator
+from stokes.fmm.kernels import Kernel
+from stokes.fmm.lists import point_ranges
+from stokes.fmm.near_field import NearField
+from stokes.fmm.transfer import FourierTransfer
+from stokes.fmm.tree import Splitting
+
+
+@dataclass(frozen=True)
+class Scheme:
+    """Everything that decides the result of a sum: two plans of one scheme give the same bits.
+
+    method       : "ufmm", "bbfmm" or "symmetric"; nodes : of a grid in one direction
+    single       : far field, and pairs of the near field, in single precision
+    derivative   : "exact", or "interpolated": transfers with the kernel's base
+    direct_below : points of a box below which neither its multipole nor its local is used by
+                   leaves of other levels
+    operator_eps : of the operators of low rank
+    """
+
+    method: str
+    nodes: int
+    splitting: Splitting
+    single: bool = False
+    derivative: str = "exact"
+    admissibility: str = "standard"
+    direct_below: int = 0
+    operator_eps: float = 1e-9
+
+
+class TreeSum:
+    """A kernel, a tree and lists over fixed points, and tables: sums for any weights."""
+
+    def __init__(
+        self,
+        kernel: Kernel,
+        sources: NDArray,
+        targets: NDArray | None,
+        scheme: Scheme,
+        parallel: Parallel,
+        threads: int = 1,
+    ) -> None:
+        """Collective. Distribute the points, build tree, lists and tables.
+
+        sources (n, 3), targets (m, 3), None for the sources: this rank's, in any unit, finite.
+        """
+        self.kernel = kernel
+        self.scheme = scheme
+        self.plan_seconds: dict[str, float] = {}
+        self.apply_seconds: dict[str, float] = {}
+        with _timed(self.plan_seconds, "tree"):
+            self.points = Distribution(
+                parallel,
+                sources,
+                targets,
+                scheme.splitting,
+                admissibility=scheme.admissibility,
+                direct_below=scheme.direct_below,
+            )
+            self._set_unit()
+        with _timed(self.plan_seconds, "lists"):
+            self.lists = self.points.lists
+        with _timed(self.plan_seconds, "tables"):
+            self._set_tables(threads)
+        with _timed(self.plan_seconds, "near"):
+            self._set_near(threads)
+
+    def _set_unit(self) -> None:
+        """Bring the points to internal coordinates: the root cube has its corner at the origin."""
+        kernel, points = self.kernel, self.points
+        self.boxes = points.boxes
+        self._root_edge = 1.0 if kernel.homogeneous else points.edge / kernel.length
+        unit = points.edge / self._root_edge
+        self._factor = kernel.factor * unit ** (kernel.degree or 0.0)
+        self._x_sources = _inside(points.x_sources, points.origin, unit)
+        self._x_targets = (
+            self._x_sources
+            if points.x_targets is points.x_sources
+            else _inside(points.x_targets, points.origin, unit)
+        )
+        self._inner = dataclasses.replace(kernel, length=1.0, factor=1.0)
+        interpolated = self.scheme.derivative == "interpolated"
+        self._gradient = kernel.derivative if interpolated else None
+        self._far = self._inner
+        if interpolated:
+            self._far = dataclasses.replace(kernel.base, length=1.0, factor=1.0)
+
+    def _set_tables(self, threads: int) -> None:
+        scheme = self.scheme
+        dtype = np.dtype(np.float32 if scheme.single else np.float64)
+        self.grid = Grid("equispaced" if scheme.method == "ufmm" else "chebyshev", scheme.nodes)
+        self._interpolator = Interpolator(self.grid, dtype, threads)
+        make = {
+            "ufmm": FourierTransfer,
+            "bbfmm": partial(CompressedTransfer, eps=scheme.operator_eps),
+            "symmetric": partial(SymmetricTransfer, eps=scheme.operator_eps),
+        }[scheme.method]
+        self.transfer = make(
+            self._far,
+            self.grid,
+            self.boxes.edges(self._root_edge),
+            admissibility=scheme.admissibility,
+            dtype=dtype,
+            threads=threads,
+        )
+        self._far_pairs = self._prepared_pairs()
+
+    def _prepared_pairs(self) -> list[Any]:
+        """The far pairs of every level that has some, in the order that the transfer wants."""
+        boxes, cells = self.boxes, self.boxes.cells()
+        prepared = []
+        for level in range(boxes.levels):
+            start, source, vector = self.lists.far.of_level(boxes, level)
+            targets = np.arange(boxes.level_start[level], boxes.level_start[level + 1])
+            if len(source):
+                prepared.append(self.transfer.prepare(level, start, source, vector, targets, cells))
+        return prepared
+
+    def _set_near(self, threads: int) -> None:
+        """Loops and ranges of the three lists that sum over points or nodes one by one."""
+        boxes, lists = self.boxes, self.lists
+        at_targets = self._inner if self._gradient != "source" else self._far
+        at_sources = self._inner if self._gradient != "target" else self._far
+        single = self.scheme.single
+        self._points_on_points = NearField(self._inner, single, threads)
+        self._grids_on_points = NearField(at_targets, single, threads)
+        self._points_on_grids = NearField(at_sources, single, threads)
+        self._near = point_ranges(boxes, lists.near)
+        # the boxes whose nodes stand for points
+        self._w_boxes = np.unique(lists.multipole_to_target.source)
+        self._w_nodes = self._nodes_of(self._w_boxes)
+        self._w_ranges = self._ranges_of_multipoles()
+        self._x_boxes = lists.source_to_local.rows()
+        self._x_nodes = self._nodes_of(self._x_boxes)
+        self._x_ranges = point_ranges(boxes, lists.source_to_local)[1:]
+
+    def _nodes_of(self, number: NDArray) -> NDArray:
+        """Grid nodes (3, k nodes^3) of k boxes, in internal coordinates."""
+        centre = self.boxes.centres(root_edge=self._root_edge)[number]
+        half = 0.5 * self.boxes.edges(self._root_edge)[self.boxes.level[number]]
+        axes = np.meshgrid(*3 * [self.grid.points], indexing="ij")
+        unit = np.stack([axis.ravel() for axis in axes])
+        nodes = centre.T[:, :, None] + half[None, :, None] * unit[:, None, :]
+        return np.ascontiguousarray(nodes.reshape(3, -1))
+
+    def _ranges_of_multipoles(self) -> tuple[NDArray, NDArray, NDArray]:
+        """W as ranges: targets (k, 2), start (k + 1,), nodes (m, 2) of boxes in `_w_boxes`."""
+        pairs = self.lists.multipole_to_target
+        rows = pairs.rows()
+        start = np.append(pairs.start[rows], pairs.start[-1])
+        place = np.searchsorted(self._w_boxes, pairs.source).astype(np.int32)
+        return self.boxes.targets[rows], start, _ranges(place, self.grid.nodes**3)
+
+    def apply(self, weights: NDArray) -> NDArray:
+        """Collective. Sums (m, n_out, r) of weights (n, n_in, r), in the caller's order."""
+        results = [self._apply_one(weights[:, :, c]) for c in range(weights.shape[2])]
+        return np.stack(results, axis=2)
+
+    def _apply_one(self, weights: NDArray) -> NDArray:
+        """One right-hand side: upward, transfers, downward, near field."""
+        clock = partial(_timed, self.apply_seconds)
+        with clock("distribute"):
+            w = self.points.scatter_weights(weights)
+        with clock("upward"):
+            multipoles = self._upward(w)
+        with clock("exchange"):
+            self.points.complete_multipoles(multipoles)
+        values = np.zeros((self.kernel.n_out, self._x_targets.shape[1]))
+        with clock("far"):
+            local = self._transfers(multipoles)
+        with clock("source_to_local"):
+            self._add_points_on_grids(w, local)
+        with clock("downward"):
+            self._downward(local, values)
+        with clock("multipole_to_target"):
+            self._add_grids_on_points(multipoles, values)
+        with clock("near"):
+            targets, start, sources = self._near
+            self._points_on_points.add(
+                self._x_targets, targets, self._x_sources, w, start, sources, values
+            )
+        with clock("distribute"):
+            return self.points.gather(self._factor * values)
+
+    def _upward(self, w: NDArray) -> NDArray:
+        """P2M at this rank's leaves, M2M to the root: multipoles (nb, n_in, nodes^3)."""
+        multipoles = self._interpolator.empty_moments(self.boxes, self._far.n_in)
+        self._interpolator.upward(
+            self.points.upward,
+            self._x_sources,
+            w,
+            multipoles,
+            self._root_edge,
+            own=self.points.has_sources,
+            gradient=self._gradient == "source",
+        )
+        return multipoles
+
+    def _transfers(self, multipoles: NDArray) -> NDArray:
+        """M2L on every level: locals (nb, n_out, nodes^3)."""
+        local = self._interpolator.empty_moments(self.boxes, self._far.n_out)
+        for pairs in self._far_pairs:
+            self.transfer.apply(pairs, multipoles, local)
+        return local
+
+    def _downward(self, local: NDArray, values: NDArray) -> None:
+        """L2L to the leaves, L2P at this rank's targets."""
+        self._interpolator.evaluate(
+            self.boxes,
+            self._x_targets,
+            local,
+            values,
+            self._root_edge,
+            own=self.points.has_targets,
+            gradient=self._gradient == "target",
+        )
+
+    def _add_points_on_grids(self, w: NDArray, local: NDArray) -> None:
+        """X: sources of larger leaves to the nodes of smaller boxes."""
+        if len(self._x_boxes) == 0:
+            return
+        size = self.grid.nodes**3
+        start, sources = self._x_ranges
+        targets = _ranges(np.arange(len(self._x_boxes)), size)
+        out = np.zeros((self._far.n_out, len(self._x_boxes) * size))
+        self._points_on_grids.add(self._x_nodes, targets, self._x_sources, w, start, sources, out)
+        local[self._x_boxes] += out.reshape(self._far.n_out, -1, size).swapaxes(0, 1)
+
+    def _add_grids_on_points(self, multipoles: NDArray, values: NDArray) -> None:
+        """W: nodes of smaller boxes to the targets of larger leaves."""
+        if len(self._w_boxes) == 0:
+            return
+        targets, start, sources = self._w_ranges
+        w = multipoles[self._w_boxes].swapaxes(0, 1).reshape(self._far.n_in, -1)
+        w = np.ascontiguousarray(w, dtype=np.float64)
+        self._grids_on_points.add(
+            self._x_targets, targets, self._w_nodes, w, start, sources, values
+        )
+
+
+def _inside(points: NDArray, origin: NDArray, unit: float) -> NDArray[np.float64]:
+    """Points (3, n) from the root cube's lowest corner, in the given unit of length."""
+    return np.ascontiguousarray((points - origin[:, None]) / unit)
+
+
+def _ranges(place: NDArray, size: int) -> NDArray:
+    """Ranges (k, 2) of `size` rows each, at the given places."""
+    return np.stack((place, place + 1), axis=1).astype(np.int64) * size
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Add the wall-clock seconds spent inside to those of the stage."""
+    start = perf_counter()
+    try:
+        yield
+    finally:
+        seconds[name] = seconds.get(name, 0.0) + perf_counter() - start
