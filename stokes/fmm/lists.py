@@ -100,7 +100,10 @@ def interaction_lists(
     Boxes of fewer points than `direct_below` get neither W (sources) nor X (targets): the pairs
     of leaves under them become near.
 
-    Raises ValueError where the table lacks boxes or points that the lists need.
+    A part of a tree gives the same rows as the whole if it holds every box whose parent, with the
+    26 boxes about the parent, meets a wanted leaf, and all boxes under one held that has fewer
+    sources than `direct_below`; and the points of each leaf which, with the 26 about it, meets a
+    wanted leaf, or which has so few sources. Raises ValueError where boxes or points lack.
     """
     if admissibility not in ("standard", "smooth"):
         raise ValueError(f"admissibility = {admissibility!r}: must be 'standard' or 'smooth'")
