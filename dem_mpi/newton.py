@@ -94,17 +94,26 @@ class NewtonSystem:
     """
 
     def __init__(
-        self, operator: Delassus, mu: NDArray, parallel: Parallel, options: NewtonOptions
+        self,
+        operator: Delassus,
+        mu: NDArray,
+        parallel: Parallel,
+        options: NewtonOptions,
+        symmetric: bool = True,
     ) -> None:
         """Collective. Choose the form and lay out the matrix. DemError on all ranks if too large.
 
         mu : (m,). The operator is used, not owned, until `take` or `destroy`.
+        symmetric : whether the blocks R are; if not the contact form is taken, factorised by LU.
         """
         self._parallel = parallel
         self._contacts = parallel.sum(mu.shape[0])
-        self.form = _choose_form(operator, options, parallel)
-        make = _VelocityForm if self.form == "velocity" else _ContactForm
-        self._form: _Form = make(operator, mu, parallel, options)
+        self.form = _choose_form(operator, options, parallel) if symmetric else "contact"
+        self._form: _Form
+        if self.form == "velocity":
+            self._form = _VelocityForm(operator, mu, parallel, options)
+        else:
+            self._form = _ContactForm(operator, mu, parallel, options, symmetric)
 
     @property
     def factor_entries(self) -> int:
@@ -319,13 +328,18 @@ class _ContactForm:
     """N + R as one matrix; N is formed once for each geometry."""
 
     def __init__(
-        self, operator: Any, mu: NDArray, parallel: Parallel, options: NewtonOptions
+        self,
+        operator: Any,
+        mu: NDArray,
+        parallel: Parallel,
+        options: NewtonOptions,
+        symmetric: bool,
     ) -> None:
         from petsc4py import PETSc
 
         self._petsc, self._parallel = PETSc, parallel
         self._columns = operator.columns
-        self._symmetric = getattr(operator, "symmetric", True)
+        self._symmetric = symmetric and getattr(operator, "symmetric", True)
         self._graph = _graph_of(operator, parallel)
         self._take_geometry(operator, mu)
         self._matrix = self._N.duplicate(copy=True)

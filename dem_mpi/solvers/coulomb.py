@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,9 @@ from dem_mpi import _kernels_solver as kernels
 from dem_mpi.cone import ConeProblem, Residuals, Tolerance, evaluate
 from dem_mpi.parallel import Parallel
 from dem_mpi.solvers.result import Solver, SolveReport
+
+if TYPE_CHECKING:
+    from dem_mpi.solvers.coulomb_newton import ProximalNewton
 
 # Merits below this are taken for it when the tolerance of a cone problem is set.
 _LAST = 10.0
@@ -52,6 +56,11 @@ _STALLED, _CAREFUL, _MORE_NOISE = 20, 0.7, 1e-1
 # From a best iterate that is so many tolerances off the bias is lowered up to so often by so many
 # times what it exceeds mu |g_t| by: contacts that close may do worse than some that open.
 _FAR, _LOWERINGS, _BELOW = 30.0, 10, 3.0
+# Newton's method on the law itself (see `coulomb_newton`) is tried after so many cone problems from
+# a best iterate within so many tolerances, again when that is better by a factor, for a few
+# factorisations; for many from the end; up to so many contacts, of all ranks.
+_FIRST_NEWTON, _NEAR, _CLOSER, _FEW_STEPS = 5, 10.0, 0.5, 6
+_MANY_STEPS, _MOST_CONTACTS = 60, 5000
 
 
 @dataclass(frozen=True)
@@ -87,6 +96,7 @@ class Coulomb:
         self.inner = inner
         self.tolerance = tolerance or Tolerance()
         self.options = options or CoulombOptions()
+        self._newton: ProximalNewton | None = None
 
     def solve(
         self,
@@ -119,7 +129,7 @@ class Coulomb:
         totals = _Totals()
         best: _Iterate | None = None
         reason = f"reached the limit of {options.max_outer} cone problems, contact.max_outer"
-        unsolved = 0
+        unsolved, tried = 0, math.inf
         while totals.outer < options.max_outer:
             # A guess that obeys the law already is taken as it is.
             finer = part * max(least, _LAST) if least > 1.0 else 1.0
@@ -130,7 +140,14 @@ class Coulomb:
             unsolved = 0 if found.inner.converged or progress else unsolved + 1
             if best is None or merit < best.merit:
                 best = found
-            if merit <= 1.0:
+            near = best.merit <= _CLOSER * tried if totals.outer >= _FIRST_NEWTON else False
+            if 1.0 < best.merit <= _NEAR and near:
+                tried = best.merit
+                polished = self._newton_steps(problem, best, tolerance, _FEW_STEPS, totals)
+                # Otherwise left aside: the fixed point goes on from its own iterates.
+                if polished.merit <= 1.0:
+                    best = polished
+            if best.merit <= 1.0:
                 break
             if not math.isfinite(merit) or unsolved == _UNSOLVED:
                 reason = f"cone problem {totals.outer}: {found.inner.reason}"
@@ -154,9 +171,50 @@ class Coulomb:
                 r[slides] *= newton[slides]
             # Where a contact stays open its bias is of no consequence, and no part of the fit.
             s = np.maximum(s + acceleration.step(s, r, closed), 0.0)
+        if 1.0 < best.merit < math.inf:
+            best = self._newton_steps(problem, best, tolerance, _MANY_STEPS, totals)
         if _FAR < best.merit < math.inf:
             best = self._lowered(problem, best, lipschitz, tolerance, totals)
         return totals.report(best, reason, lipschitz)
+
+    def _newton_steps(
+        self,
+        problem: ConeProblem,
+        best: _Iterate,
+        tolerance: Tolerance,
+        budget: int,
+        totals: _Totals,
+    ) -> _Iterate:
+        """Collective. What Newton's method makes of the best iterate, if that is better.
+
+        Nothing without a matrix N, or with too many contacts to factorise it in passing.
+        """
+        contacts = problem.parallel.sum(problem.contacts)
+        positive = bool((problem.operator.diagonal() > 0.0).all())
+        if (
+            contacts > _MOST_CONTACTS
+            or not hasattr(problem.operator, "delassus")
+            or problem.parallel.any(not positive)
+        ):
+            return best
+        # Not at the top: it needs PETSc, of which a solve that does not come to this needs nothing.
+        from dem_mpi.solvers.coulomb_newton import ProximalNewton
+
+        self._newton = self._newton or ProximalNewton()
+        found = self._newton.improve(problem, best.impulse, tolerance, budget)
+        if found is None:
+            return best
+        totals.factorisations += found.factorisations
+        totals.products += found.products
+        if not found.merit < best.merit:
+            return best
+        return replace(
+            best,
+            impulse=found.impulse,
+            velocity=found.velocity,
+            residuals=found.residuals,
+            merit=found.merit,
+        )
 
     def _lowered(
         self,
@@ -203,6 +261,9 @@ class Coulomb:
     def destroy(self) -> None:
         """Collective. Free what the inner solver keeps between solves."""
         self.inner.destroy()
+        if self._newton is not None:
+            self._newton.destroy()
+            self._newton = None
 
 
 def slip_bias(mu: NDArray, g: NDArray) -> NDArray:

@@ -473,3 +473,60 @@ def test_shaken_heap_obeys_the_law_on_any_number_of_ranks(parallel):
     assert np.max(-g[:, 0], initial=0.0) <= 1e-5
     sliding = (np.linalg.norm(g[:, 1:], axis=1) > 1e-3) & (gamma[:, 0] > 0)
     assert len(gathered(parallel, g[sliding])) > 10
+
+
+def heap_problem(parallel: Parallel):
+    """Collective. The cone problem of a step of the heap and its solution to 1e-5."""
+    from dem_mpi.simulation import Simulation
+
+    scenario = scene(**heap(law="coulomb", tolerance=1e-5, complementarity=1e-5))
+    simulation = Simulation(parallel, scenario, placed(parallel, scenario))
+    seen = watch(simulation)
+    for _ in range(8):
+        assert simulation.step().converged
+    return seen.problem, seen.report.impulse
+
+
+@ranks_1_2_3
+def test_newton_steps_take_the_law_from_a_coarse_solution_to_round_off(parallel):
+    """From 1e-5 m/s to 1e-10 v_ref: Newton's method doubles digits where the fixed point's rate
+    is that of its contraction. Residuals are held against the law's definition."""
+    from dem_mpi.solvers.coulomb_newton import ProximalNewton
+
+    problem, coarse = heap_problem(parallel)
+    before = coarse.copy()
+    wanted = tight(1e-10)
+    newton = ProximalNewton()
+    found = newton.improve(problem, coarse, wanted, 60)
+    again = newton.improve(problem, coarse, wanted, 60)  # on the matrix that was kept
+    newton.destroy()
+    assert coarse.tobytes() == before.tobytes()
+    assert found.impulse.tobytes() == again.impulse.tobytes()
+    assert found.merit <= 1.0
+    assert 1 <= found.factorisations <= 60
+    gamma, g, mu = found.impulse, found.velocity, problem.mu
+    push = np.linalg.norm(gamma[:, 1:], axis=1)
+    assert np.all(push <= mu * gamma[:, 0] * (1 + 4 * EPS))
+    work = np.abs(np.sum(gamma * lifted(g, mu), axis=1))
+    assert work.max(initial=0.0) <= 1e-10 * problem.velocity_scale * problem.impulse_scale
+    assert np.max(-g[:, 0], initial=0.0) <= 1e-10 * problem.velocity_scale
+    sliding = (np.linalg.norm(g[:, 1:], axis=1) > 1e-3) & (gamma[:, 0] > 0)
+    assert parallel.sum(np.count_nonzero(sliding)) > 5
+    agree = parallel.allgather(np.array([found.merit, float(found.factorisations)]))
+    assert not np.ptp(agree, axis=0).any()
+
+
+@ranks_1_2_3
+def test_newton_steps_end_at_their_budget_with_the_best_point(parallel):
+    """One factorisation from zero is not enough; what it leaves is no worse than zero was."""
+    from dem_mpi.solvers.coulomb_newton import ProximalNewton
+
+    problem, coarse = heap_problem(parallel)
+    nothing = np.zeros_like(coarse)
+    start = law_residuals(problem, nothing, problem.b)
+    newton, wanted = ProximalNewton(), tight(1e-10)
+    found = newton.improve(problem, nothing, wanted, 1)
+    newton.destroy()
+    assert found.factorisations == 1
+    assert 1.0 < found.merit <= wanted.merit(start, problem)
+    assert np.isfinite(found.impulse).all()
