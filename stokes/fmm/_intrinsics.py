@@ -10,26 +10,25 @@ from numba.extending import intrinsic
 
 
 @intrinsic
-def load_components(typingctx: Any, rows: Any, column: Any, count: Any) -> Any:
-    """rows[0, column], ..., rows[count - 1, column] of a C-contiguous array as a tuple.
+def load_components(typingctx: Any, rows: Any, column: Any, like: Any) -> Any:
+    """rows[0, column], rows[1, column], ... of a C-contiguous array, a tuple of the type of like.
 
-    count must be a constant of the loop's closure. No bounds are checked.
+    No bounds are checked.
     """
-    if not isinstance(count, types.IntegerLiteral):
+    if not isinstance(like, types.UniTuple) or like.dtype != rows.dtype:
         return None
-    result = types.UniTuple(rows.dtype, count.literal_value)
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         array = context.make_array(rows)(context, builder, arguments[0])
         stride = cgutils.unpack_tuple(builder, array.shape)[1]
         position = context.cast(builder, arguments[1], column, types.intp)
         loaded = []
-        for _ in range(count.literal_value):
+        for _ in range(like.count):
             loaded.append(builder.load(builder.gep(array.data, [position])))
             position = builder.add(position, stride)
-        return context.make_tuple(builder, result, loaded)
+        return context.make_tuple(builder, like, loaded)
 
-    return result(rows, column, count), generate
+    return like(rows, column, like), generate
 
 
 @intrinsic

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -68,7 +70,7 @@ def _groups(m: int) -> NDArray:
     return np.stack([begin, np.minimum(begin + _GROUP, m)], axis=1)
 
 
-def _blocks(y: NDArray, w: NDArray, parallel: Parallel | None):  # noqa: ANN202
+def _blocks(y: NDArray, w: NDArray, parallel: Parallel | None) -> Iterator[tuple[NDArray, NDArray]]:
     """Sources and weights of one rank after another, in rank order on all of them."""
     if parallel is None or parallel.size == 1:
         yield y, w

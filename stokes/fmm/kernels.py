@@ -16,7 +16,7 @@ been edited is compiled anew, but functions it takes from third files are not wa
 
 - A singular kernel vanishes at r = 0, which leaves out the term of a source on itself. Written in
   powers of `inverse_distance` it does so without a branch, and the loop over sources vectorises.
-- For the use of single precision no literal may promote: `times(3.0, x)` instead of `3.0 * x`.
+- For the use of single precision no literal may promote: `constant(3.0, x) * x` for `3.0 * x`.
 
 Symbols: r2 = |r|^2, `inverse` = 1/|r|. Constants such as 1/(8 pi viscosity) are left to the
 caller; the Stokes kernels share the one prefactor 1/(8 pi viscosity).
@@ -39,6 +39,7 @@ from numba import types
 from numba.extending import overload, register_jitable
 from numpy.typing import ArrayLike, NDArray
 
+from stokes.fmm import _intrinsics
 from stokes.fmm._intrinsics import bits, from_bits, load_components
 
 Indices = tuple[int, ...]
@@ -153,8 +154,9 @@ class Kernel:
         return replace(KERNELS[self.transpose], length=self.length, factor=self.factor)
 
 
+@functools.cache
 def digest(apply: Callable) -> str:
-    """Fingerprint of the sources that define a kernel: its file's and this file's.
+    """Fingerprint of the sources that define a kernel: its own file and what it is written with.
 
     The loops over pairs carry it as a constant, so that their disk cache knows edited kernels.
     """
@@ -162,18 +164,21 @@ def digest(apply: Callable) -> str:
         text = Path(inspect.getsourcefile(apply) or "").read_bytes()
     except (OSError, TypeError):  # typed in at a prompt
         text = apply.__code__.co_code + repr(apply.__code__.co_consts).encode()
-    return hashlib.sha256(text + Path(__file__).read_bytes()).hexdigest()
+    common = Path(__file__).read_bytes() + Path(_intrinsics.__file__).read_bytes()
+    return hashlib.sha256(text + common).hexdigest()
 
 
 @functools.cache
 def _matrix(apply: Callable, n_in: int, n_out: int, digest: str) -> Callable:
+    zero = (0.0,) * n_in
+
     @numba.njit(cache=True, nogil=True, error_model="numpy")
     def evaluate(points: NDArray, identity: NDArray, out: NDArray) -> None:
         _ = digest  # a cell of this closure: part of the key of the disk cache
         for k in range(len(points)):
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
             for j in range(n_in):
-                column = apply(x, y, z, load_components(identity, j, n_in))
+                column = apply(x, y, z, load_components(identity, j, zero))
                 for i in range(n_out):
                     out[k, i, j] = column[i]
 
@@ -228,7 +233,7 @@ def inverse_distance(r2: float) -> float:
 
 
 @overload(inverse_distance)
-def _inverse_distance(r2):  # noqa: ANN001, ANN202
+def _inverse_distance(r2):
     if r2 == types.float32:
 
         def single(r2):
@@ -236,7 +241,7 @@ def _inverse_distance(r2):  # noqa: ANN001, ANN202
             e = np.float32(1.0) - r2 * y * y
             y += y * e * (np.float32(0.5) + e * np.float32(0.375))
             e = np.float32(1.0) - r2 * y * y
-            y += y * e * (np.float32(0.5) + e * np.float32(0.375))
+            y += y * e * np.float32(0.5)
             return y if r2 > np.float32(0.0) else np.float32(0.0)
 
         return single
@@ -252,16 +257,72 @@ def _inverse_distance(r2):  # noqa: ANN001, ANN202
     return double
 
 
-def times(constant: float, value: float) -> float:
-    """constant * value in the precision of value; for compiled kernels."""
-    return constant * value
+def constant(value: float, like: float) -> float:
+    """The number in the precision of `like`; for compiled kernels."""
+    return value
 
 
-@overload(times)
-def _times(constant, value):  # noqa: ANN001, ANN202
-    if value == types.float32:
-        return lambda constant, value: np.float32(constant) * value
-    return lambda constant, value: constant * value
+@overload(constant)
+def _constant(value, like):
+    if like == types.float32:
+        return lambda value, like: np.float32(value)
+    return lambda value, like: value
+
+
+def decay(t: float) -> float:
+    """exp(-t) for t >= 0 within 4 units in the last place while t < 30; for compiled kernels.
+
+    exp(-t) = 2^-n exp(-f) with |f| <= log(2)/2 and Taylor's sum for the second factor: unlike a
+    call of the library this is vectorised. Beyond, the relative error grows by 2e-17 t; 0 where
+    the result would not be a normal number.
+    """
+    return math.exp(-t)
+
+
+@overload(decay)
+def _decay(t):
+    if t == types.float32:
+
+        def single(t):
+            n = np.int32(t * np.float32(_LOG2_E) + np.float32(0.5))
+            f = t - np.float32(n) * np.float32(_LOG_2)
+            p = np.float32(1 / 720) - f * np.float32(1 / 5040)
+            p = np.float32(1 / 24) - f * (np.float32(1 / 120) - f * p)
+            p = np.float32(1 / 2) - f * (np.float32(1 / 6) - f * p)
+            p = np.float32(1) - f * (np.float32(1) - f * p)
+            value = p * from_bits(np.int32((127 - n) << 23))
+            return np.float32(0.0) if t > np.float32(87.0) else value
+
+        return single
+
+    def double(t):
+        n = np.int64(t * _LOG2_E + 0.5)
+        f = t - n * _LOG_2
+        p = 1 / 479001600 - f * (1 / 6227020800)
+        p = 1 / 3628800 - f * (1 / 39916800 - f * p)
+        p = 1 / 40320 - f * (1 / 362880 - f * p)
+        p = 1 / 720 - f * (1 / 5040 - f * p)
+        p = 1 / 24 - f * (1 / 120 - f * p)
+        p = 1 / 2 - f * (1 / 6 - f * p)
+        p = 1.0 - f * (1.0 - f * p)
+        value = p * from_bits((1023 - n) << 52)
+        return 0.0 if t > 708.0 else value
+
+    return double
+
+
+_LOG2_E, _LOG_2 = 1.0 / math.log(2.0), math.log(2.0)
+
+
+@register_jitable
+def _r2(x, y, z):
+    return x * x + y * y + z * z
+
+
+@register_jitable
+def _form(x, y, z, w):
+    """r.W r of a symmetric tensor; w its diagonal, then twice 12, 02, 01."""
+    return x * (x * w[0] + y * w[5]) + y * (y * w[1] + z * w[3]) + z * (z * w[2] + x * w[4])
 
 
 # --- scalar kernels ----------------------------------------------------------------------------
@@ -269,41 +330,397 @@ def _times(constant, value):  # noqa: ANN001, ANN202
 
 @register_jitable
 def _laplace(x, y, z, w):
-    return (w[0] * inverse_distance(x * x + y * y + z * z),)
+    return (w[0] * inverse_distance(_r2(x, y, z)),)
+
+
+@register_jitable
+def _inverse_square(x, y, z, w):
+    inverse = inverse_distance(_r2(x, y, z))
+    return (w[0] * (inverse * inverse),)
+
+
+@register_jitable
+def _inverse_fourth(x, y, z, w):
+    inverse = inverse_distance(_r2(x, y, z))
+    inverse2 = inverse * inverse
+    return (w[0] * (inverse2 * inverse2),)
 
 
 @register_jitable
 def _gaussian(x, y, z, w):
-    return (w[0] * math.exp(-(x * x + y * y + z * z)),)
+    return (w[0] * decay(_r2(x, y, z)),)
+
+
+@register_jitable
+def _exponential(x, y, z, w):
+    r2 = _r2(x, y, z)
+    return (w[0] * decay(r2 * inverse_distance(r2)),)
+
+
+@register_jitable
+def _matern52(x, y, z, w):
+    r2 = _r2(x, y, z)
+    s = constant(math.sqrt(5.0), r2) * (r2 * inverse_distance(r2))
+    return (w[0] * decay(s) * (constant(1.0, s) + s * (constant(1.0, s) + s * constant(1 / 3, s))),)
+
+
+laplace = Kernel("laplace", _laplace, 1, 1, degree=-1.0, parity=1, single=True, transpose="laplace")
+"""1/r."""
+
+inverse_square = replace(
+    laplace, name="inverse_square", apply=_inverse_square, degree=-2.0, transpose="inverse_square"
+)
+"""1/r^2."""
+
+inverse_fourth = replace(
+    laplace, name="inverse_fourth", apply=_inverse_fourth, degree=-4.0, transpose="inverse_fourth"
+)
+"""1/r^4."""
+
+
+def _covariance(name: str, apply: Callable, length: float, smooth: bool) -> Kernel:
+    return Kernel(
+        *(name, apply, 1, 1), parity=1, smooth=smooth, length=length, single=True, transpose=name
+    )
+
+
+def gaussian(length: float = 1.0) -> Kernel:
+    """exp(-r^2/length^2)."""
+    return _covariance("gaussian", _gaussian, length, smooth=True)
+
+
+def exponential(length: float = 1.0) -> Kernel:
+    """exp(-r/length); finite at the origin, but not smooth."""
+    return _covariance("exponential", _exponential, length, smooth=False)
+
+
+def matern52(length: float = 1.0) -> Kernel:
+    """(1 + s + s^2/3) exp(-s), s = sqrt(5) r/length; four times differentiable at the origin."""
+    return _covariance("matern52", _matern52, length, smooth=False)
+
+
+# --- derivatives of 1/r ------------------------------------------------------------------------
+
+
+@register_jitable
+def _laplace_gradient(x, y, z, w):
+    inverse = inverse_distance(_r2(x, y, z))
+    s = -w[0] * (inverse * inverse * inverse)
+    return (x * s, y * s, z * s)
+
+
+@register_jitable
+def _laplace_dipole(x, y, z, w):
+    inverse = inverse_distance(_r2(x, y, z))
+    return ((x * w[0] + y * w[1] + z * w[2]) * (inverse * inverse * inverse),)
+
+
+@register_jitable
+def _laplace_dipole_gradient(x, y, z, w):
+    inverse = inverse_distance(_r2(x, y, z))
+    inverse2 = inverse * inverse
+    s = constant(-3.0, x) * (x * w[0] + y * w[1] + z * w[2]) * inverse2
+    inverse3 = inverse2 * inverse
+    return ((w[0] + x * s) * inverse3, (w[1] + y * s) * inverse3, (w[2] + z * s) * inverse3)
+
+
+@register_jitable
+def _laplace_quadrupole(x, y, z, w):
+    inverse = inverse_distance(_r2(x, y, z))
+    inverse2 = inverse * inverse
+    s = constant(3.0, x) * _form(x, y, z, w) * inverse2
+    return ((s - (w[0] + w[1] + w[2])) * (inverse2 * inverse),)
+
+
+@register_jitable
+def _laplace_hessian(x, y, z, w):
+    inverse = inverse_distance(_r2(x, y, z))
+    inverse2 = inverse * inverse
+    trace = -w[0] * (inverse2 * inverse)
+    s = constant(-3.0, x) * trace * inverse2
+    return (
+        x * x * s + trace,
+        y * y * s + trace,
+        z * z * s + trace,
+        y * z * s,
+        x * z * s,
+        x * y * s,
+    )
+
+
+laplace_gradient = Kernel(
+    "laplace_gradient",
+    *(_laplace_gradient, 1, 3),
+    degree=-2.0,
+    parity=-1,
+    single=True,
+    transpose="laplace_dipole",
+    base=laplace,
+    derivative="target",
+)
+"""d/dx_i 1/r = -r_i/r^3."""
+
+laplace_dipole = Kernel(
+    "laplace_dipole",
+    *(_laplace_dipole, 3, 1),
+    degree=-2.0,
+    parity=-1,
+    single=True,
+    transpose="laplace_gradient",
+    base=laplace,
+    derivative="source",
+)
+"""d/dy_k 1/r = r_k/r^3: the double layer, with the weights w_k = density times normal."""
+
+laplace_dipole_gradient = Kernel(
+    "laplace_dipole_gradient",
+    *(_laplace_dipole_gradient, 3, 3),
+    degree=-3.0,
+    parity=1,
+    entry=_entries(VECTOR, VECTOR, _sorted),
+    single=True,
+    transpose="laplace_dipole_gradient",
+    base=laplace_dipole,
+    derivative="target",
+)
+"""d/dx_i d/dy_k 1/r = delta_ik/r^3 - 3 r_i r_k/r^5."""
+
+laplace_quadrupole = Kernel(
+    "laplace_quadrupole",
+    *(_laplace_quadrupole, 6, 1),
+    degree=-3.0,
+    parity=1,
+    single=True,
+    transpose="laplace_hessian",
+)
+"""(3 r_j r_k/r^5 - delta_jk/r^3) S_jk; the six weights as for `stresslet`."""
+
+laplace_hessian = Kernel(
+    "laplace_hessian",
+    *(_laplace_hessian, 1, 6),
+    degree=-3.0,
+    parity=1,
+    single=True,
+    transpose="laplace_quadrupole",
+)
+"""d/dx_i d/dx_j 1/r = 3 r_i r_j/r^5 - delta_ij/r^3 in the order 00, 11, 22, 12, 02, 01."""
+
+
+# --- Stokes flow -------------------------------------------------------------------------------
+# Common prefactor 1/(8 pi viscosity) (pressures and stresses: 1/(8 pi)).
 
 
 @register_jitable
 def _stokeslet(x, y, z, w):
     # u_i = w_i/r + r_i (r.w)/r^3
-    inverse = inverse_distance(x * x + y * y + z * z)
+    inverse = inverse_distance(_r2(x, y, z))
     s = (x * w[0] + y * w[1] + z * w[2]) * (inverse * inverse)
     return ((w[0] + x * s) * inverse, (w[1] + y * s) * inverse, (w[2] + z * s) * inverse)
 
 
-laplace = Kernel("laplace", _laplace, 1, 1, degree=-1.0, parity=1, single=True, transpose="laplace")
+@register_jitable
+def _stokeslet_gradient(x, y, z, w):
+    # du_i/dx_k = (-w_i r_k + r_i w_k + delta_ik r.w)/r^3 - 3 r_i r_k (r.w)/r^5
+    inverse = inverse_distance(_r2(x, y, z))
+    inverse2 = inverse * inverse
+    inverse3 = inverse2 * inverse
+    a, b, c = w[0] * inverse3, w[1] * inverse3, w[2] * inverse3
+    dot = x * a + y * b + z * c
+    s = constant(-3.0, x) * dot * inverse2
+    xy, xz, yz = x * y * s, x * z * s, y * z * s
+    p, q, t = x * b - y * a, x * c - z * a, y * c - z * b
+    return (
+        *(x * x * s + dot, xy + p, xz + q),
+        *(xy - p, y * y * s + dot, yz + t),
+        *(xz - q, yz - t, z * z * s + dot),
+    )
+
+
+@register_jitable
+def _stresslet(x, y, z, w):
+    # u_i = 6 r_i r_j r_k S_jk / r^5
+    inverse = inverse_distance(_r2(x, y, z))
+    inverse2 = inverse * inverse
+    s = constant(6.0, x) * _form(x, y, z, w) * (inverse2 * inverse2 * inverse)
+    return (x * s, y * s, z * s)
+
+
+@register_jitable
+def _stokes_stress(x, y, z, w):
+    # sigma_ij = -6 r_i r_j (r.w) / r^5
+    inverse = inverse_distance(_r2(x, y, z))
+    inverse2 = inverse * inverse
+    dot = x * w[0] + y * w[1] + z * w[2]
+    s = constant(-6.0, x) * dot * (inverse2 * inverse2 * inverse)
+    xs, ys, zs = x * s, y * s, z * s
+    return (x * xs, y * ys, z * zs, y * zs, x * zs, x * ys)
+
+
 stokeslet = Kernel(
     "stokeslet",
-    _stokeslet,
-    3,
-    3,
+    *(_stokeslet, 3, 3),
     degree=-1.0,
     parity=1,
     entry=_entries(VECTOR, VECTOR, _sorted),
     single=True,
     transpose="stokeslet",
 )
+"""delta_ij/r + r_i r_j/r^3: velocity of forces (single layer)."""
+
+stokeslet_pressure = replace(
+    laplace_dipole, name="stokeslet_pressure", factor=2.0, base=replace(laplace, factor=2.0)
+)
+"""2 r_j/r^3: pressure of the flow of `stokeslet`."""
+
+stokeslet_gradient = Kernel(
+    "stokeslet_gradient",
+    *(_stokeslet_gradient, 3, 9),
+    degree=-2.0,
+    parity=-1,
+    outputs=TENSOR,
+    entry=_entries(TENSOR, VECTOR, lambda index: (*_sorted((index[0], index[2])), index[1])),
+    single=True,
+    base=stokeslet,
+    derivative="target",
+)
+"""du_i/dx_k of the flow of `stokeslet`, output 3 i + k."""
+
+stresslet = Kernel(
+    "stresslet",
+    *(_stresslet, 6, 3),
+    degree=-2.0,
+    parity=-1,
+    entry=_entries(VECTOR, SYMMETRIC, _sorted),
+    single=True,
+    transpose="stokes_stress",
+)
+"""6 r_i r_j r_k/r^5: velocity of the double layer, -8 pi inside a closed surface of density 1.
+
+Contracted with density q_j times outward normal n_k: the weights are the six sums of
+`stresslet_weights`, q_0 n_0, q_1 n_1, q_2 n_2, q_1 n_2 + q_2 n_1, q_0 n_2 + q_2 n_0,
+q_0 n_1 + q_1 n_0.
+"""
+
+stresslet_pressure = replace(laplace_quadrupole, name="stresslet_pressure", factor=4.0)
+"""4 (3 r_j r_k/r^5 - delta_jk/r^3): pressure of the flow of `stresslet`."""
+
+stokes_stress = Kernel(
+    "stokes_stress",
+    *(_stokes_stress, 3, 6),
+    degree=-2.0,
+    parity=-1,
+    entry=_entries(SYMMETRIC, VECTOR, _sorted),
+    single=True,
+    transpose="stresslet",
+)
+"""-6 r_i r_j r_k/r^5: stress of the flow of `stokeslet` in the order 00, 11, 22, 12, 02, 01."""
 
 
-def gaussian(length: float = 1.0) -> Kernel:
-    """exp(-|r|^2 / length^2)."""
-    return Kernel(
-        "gaussian", _gaussian, 1, 1, parity=1, smooth=True, length=length, transpose="gaussian"
+def stresslet_weights(density: ArrayLike, normals: ArrayLike) -> NDArray:
+    """Weights (n, 6) of `stresslet` for a double layer: density (n, 3), outward normals (n, 3)."""
+    product = np.einsum("nj,nk->njk", density, normals)
+    both = product + product.transpose(0, 2, 1)
+    return np.stack([(product if j == k else both)[:, j, k] for j, k in SYMMETRIC], axis=1)
+
+
+def traction(stress: ArrayLike, normals: ArrayLike) -> NDArray:
+    """sigma n (n, 3) of stresses (n, 6) in the order 00, 11, 22, 12, 02, 01 and normals (n, 3)."""
+    s, n = np.asarray(stress), np.asarray(normals)
+    row = [[SYMMETRIC.index(_sorted((i, j))) for j in range(3)] for i in range(3)]
+    return np.einsum("nij,nj->ni", s[:, row], n)
+
+
+# --- softened distance r_a = sqrt(r^2 + a^2) ---------------------------------------------------
+# The functions see r/a, so that a is 1 in them.
+
+
+@register_jitable
+def _softened(x, y, z, w):
+    return (w[0] * inverse_distance(_r2(x, y, z) + constant(1.0, x)),)
+
+
+@register_jitable
+def _softened_gradient(x, y, z, w):
+    s = w[0] * inverse_distance(_r2(x, y, z) + constant(1.0, x))
+    return (x * s, y * s, z * s)
+
+
+@register_jitable
+def _softened_hessian(x, y, z, w):
+    # delta_ij/r_a - r_i r_j/r_a^3
+    inverse = inverse_distance(_r2(x, y, z) + constant(1.0, x))
+    t = w[0] * inverse
+    s = -t * (inverse * inverse)
+    return (x * x * s + t, y * y * s + t, z * z * s + t, y * z * s, x * z * s, x * y * s)
+
+
+@register_jitable
+def _softened_third(x, y, z, w):
+    # -(delta_ij r_k + delta_jk r_i + delta_ki r_j)/r_a^3 + 3 r_i r_j r_k/r_a^5
+    inverse = inverse_distance(_r2(x, y, z) + constant(1.0, x))
+    inverse2 = inverse * inverse
+    t = -w[0] * (inverse2 * inverse)
+    s = constant(-3.0, x) * t * inverse2
+    xx, yy, zz = x * x * s + t, y * y * s + t, z * z * s + t
+    two = t + t
+    return (
+        *(x * (xx + two), y * (yy + two), z * (zz + two), y * xx, z * xx),
+        *(x * yy, z * yy, x * zz, y * zz, x * y * z * s),
     )
 
 
-KERNELS: dict[str, Kernel] = {k.name: k for k in (laplace, stokeslet, gaussian())}
+def softened(length: float = 1.0) -> Kernel:
+    """1/r_a with a = length."""
+    return Kernel(
+        "softened",
+        *(_softened, 1, 1),
+        parity=1,
+        smooth=True,
+        length=length,
+        factor=1.0 / length,
+        single=True,
+        transpose="softened",
+    )
+
+
+def softened_distance_gradient(length: float = 1.0) -> Kernel:
+    """dr_a/dx_i with a = length."""
+    return _of_softened_distance("gradient", _softened_gradient, 1, length)
+
+
+def softened_distance_hessian(length: float = 1.0) -> Kernel:
+    """d2 r_a/dx_i dx_j with a = length, in the order 00, 11, 22, 12, 02, 01."""
+    return _of_softened_distance("hessian", _softened_hessian, 2, length)
+
+
+def softened_distance_third(length: float = 1.0) -> Kernel:
+    """d3 r_a/dx_i dx_j dx_k with a = length, in the order of `SYMMETRIC_THIRD`."""
+    return _of_softened_distance("third", _softened_third, 3, length)
+
+
+def _of_softened_distance(name: str, apply: Callable, order: int, length: float) -> Kernel:
+    outputs = (VECTOR, SYMMETRIC, SYMMETRIC_THIRD)[order - 1]
+    return Kernel(
+        f"softened_distance_{name}",
+        *(apply, 1, len(outputs)),
+        parity=(-1) ** order,
+        smooth=True,
+        length=length,
+        factor=length ** (1 - order),
+        single=True,
+    )
+
+
+KERNELS: dict[str, Kernel] = {
+    kernel.name: kernel
+    for kernel in (
+        *(laplace, inverse_square, inverse_fourth, gaussian(), exponential(), matern52()),
+        *(laplace_gradient, laplace_dipole, laplace_dipole_gradient),
+        *(laplace_quadrupole, laplace_hessian),
+        *(stokeslet, stokeslet_pressure, stokeslet_gradient),
+        *(stresslet, stresslet_pressure, stokes_stress),
+        *(softened(), softened_distance_gradient()),
+        *(softened_distance_hessian(), softened_distance_third()),
+    )
+}
+"""All kernels by name; those with a length at length 1."""

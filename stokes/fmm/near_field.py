@@ -18,14 +18,15 @@ from collections.abc import Callable
 import numba
 import numpy as np
 from numba import prange
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from stokes.fmm._intrinsics import add_components, load_components
 from stokes.fmm.kernels import Kernel, digest
 
 _REORDERED = {"reassoc", "contract", "nsz", "arcp"}
-_TILE = 512  # sources of a tile: 6 rows of doubles take 24 KiB
-_VECTOR = 32  # a tile's length is a multiple of it: 4 vectors of 8 doubles
+_ROW = 4096  # bytes of a tile's row: six rows take half of a first-level cache
+_VECTORS = 256  # bytes; a row is filled up to a multiple: four vectors
 
 
 class NearField:
@@ -72,11 +73,11 @@ class NearField:
             numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))
         self._loop(
             targets,
-            target_range,
+            np.ascontiguousarray(target_range, np.int64),
             sources,
             weights,
-            start,
-            source_range,
+            np.ascontiguousarray(start, np.int64),
+            np.ascontiguousarray(source_range, np.int64),
             1.0 / self.kernel.length,
             self.kernel.factor,
             out,
@@ -105,74 +106,94 @@ def _loop(
     numba's disk cache keys a closure by the values it closes over: functions by their names,
     hence the digest of the kernel's source among them.
     """
-    gather, sum_tile = _gather(n_in, real), _sum_tile(apply, n_in, n_out, real, digest)
+    zero_in, zero_out = (real(0.0),) * n_in, (real(0.0),) * n_out
+    rows, columns = 3 + n_in, _ROW // np.dtype(real).itemsize
 
     @numba.njit(cache=True, nogil=True, error_model="numpy", parallel=threaded)
     def near_loop(targets, target_range, sources, weights, start, source_range, scale, factor, out):
+        _ = digest
         for g in prange(len(target_range)):
             first, last = target_range[g, 0], target_range[g, 1]
             if first == last:
                 continue
-            centre = np.empty(3)
-            for d in range(3):
-                centre[d] = 0.5 * (targets[d, first:last].min() + targets[d, first:last].max())
-            tile = np.empty((3 + n_in, _TILE), real)
+            centre = _middle(targets, first, last)
+            tile = np.empty((rows, columns), real)
             filled = 0
             for k in range(start[g], start[g + 1]):
                 begin, end = source_range[k, 0], source_range[k, 1]
                 while begin < end:
-                    taken = min(end - begin, _TILE - filled)
-                    gather(sources, weights, begin, taken, centre, scale, tile, filled)
+                    taken = min(end - begin, columns - filled)
+                    _gather(sources, weights, begin, taken, centre, scale, tile, filled)
                     begin += taken
                     filled += taken
-                    if filled == _TILE:
-                        sum_tile(targets, first, last, centre, scale, tile, filled, factor, out)
+                    if filled == columns:
+                        _fill_up(tile, filled)
+                        _sum_tile(
+                            *(apply, zero_in, zero_out, targets, first, last, centre, scale),
+                            *(tile, filled, factor, out),
+                        )
                         filled = 0
             if filled > 0:
-                sum_tile(targets, first, last, centre, scale, tile, filled, factor, out)
+                _fill_up(tile, filled)
+                _sum_tile(
+                    *(apply, zero_in, zero_out, targets, first, last, centre, scale),
+                    *(tile, filled, factor, out),
+                )
 
     return near_loop
 
 
-@functools.cache
-def _gather(n_in: int, real: type) -> Callable:
-    @numba.njit(nogil=True, error_model="numpy", fastmath=_REORDERED)
-    def gather(sources, weights, begin, count, centre, scale, tile, filled):
-        """Copy sources [begin, begin + count) to the columns of the tile from `filled` on."""
-        for d in range(3):
-            for j in range(count):
-                tile[d, filled + j] = real((sources[d, begin + j] - centre[d]) * scale)
-        for c in range(n_in):
-            for j in range(count):
-                tile[3 + c, filled + j] = real(weights[c, begin + j])
-
-    return gather
+@register_jitable
+def _middle(targets, first, last):
+    """Centre of the box around targets [first, last)."""
+    low, high = targets[:, first].copy(), targets[:, first].copy()
+    for d in range(3):
+        for i in range(first + 1, last):
+            low[d] = min(low[d], targets[d, i])
+            high[d] = max(high[d], targets[d, i])
+    return 0.5 * (low + high)
 
 
-@functools.cache
-def _sum_tile(apply: Callable, n_in: int, n_out: int, real: type, digest: str) -> Callable:
-    @numba.njit(nogil=True, error_model="numpy", fastmath=_REORDERED)
-    def sum_tile(targets, first, last, centre, scale, tile, filled, factor, out):
-        """Add the sums over the first `filled` columns of the tile to targets [first, last)."""
-        _ = digest
-        count = -(-filled // _VECTOR) * _VECTOR
-        for j in range(filled, count):
-            for d in range(3):
-                tile[d, j] = tile[d, filled - 1]
-            for c in range(n_in):
-                tile[3 + c, j] = real(0.0)
-        weights = tile[3:]
-        zero = load_components(np.zeros((n_out, 1), real), 0, n_out)
-        for i in range(first, last):
-            x = real((targets[0, i] - centre[0]) * scale)
-            y = real((targets[1, i] - centre[1]) * scale)
-            z = real((targets[2, i] - centre[2]) * scale)
-            total = zero
-            for j in range(count):
-                r = (x - tile[0, j], y - tile[1, j], z - tile[2, j])
-                w = load_components(weights, j, n_in)
-                total = add_components(total, apply(r[0], r[1], r[2], w))
-            for o in range(n_out):
-                out[o, i] += factor * total[o]
+@register_jitable
+def _gather(sources, weights, begin, count, centre, scale, tile, filled):
+    """Copy sources [begin, begin + count) to the columns of the tile from `filled` on."""
+    for d in range(3):
+        for j in range(count):
+            tile[d, filled + j] = (sources[d, begin + j] - centre[d]) * scale
+    for c in range(len(weights)):
+        for j in range(count):
+            tile[3 + c, filled + j] = weights[c, begin + j]
 
-    return sum_tile
+
+@register_jitable
+def _fill_up(tile, filled):
+    """Repeat the last source with weight zero up to a whole number of vectors."""
+    for j in range(filled, _whole_vectors(tile, filled)):
+        tile[:3, j] = tile[:3, filled - 1]
+        tile[3:, j] = 0.0
+
+
+@register_jitable
+def _whole_vectors(tile, filled):
+    vector = _VECTORS // tile.itemsize
+    return -(-filled // vector) * vector
+
+
+@register_jitable(fastmath=_REORDERED)
+def _sum_tile(
+    apply, zero_in, zero_out, targets, first, last, centre, scale, tile, filled, factor, out
+):
+    """Add the sums over the first `filled` columns of the tile to targets [first, last)."""
+    weights = tile[3:]
+    real = tile.dtype.type
+    for i in range(first, last):
+        x = real((targets[0, i] - centre[0]) * scale)
+        y = real((targets[1, i] - centre[1]) * scale)
+        z = real((targets[2, i] - centre[2]) * scale)
+        total = zero_out
+        for j in range(_whole_vectors(tile, filled)):
+            w = load_components(weights, j, zero_in)
+            k = apply(x - tile[0, j], y - tile[1, j], z - tile[2, j], w)
+            total = add_components(total, k)
+        for o in range(len(total)):
+            out[o, i] += factor * total[o]
