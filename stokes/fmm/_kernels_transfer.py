@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
@@ -21,9 +20,8 @@ from numba.extending import intrinsic
 from dem_mpi._jit import jit, jit_threads, prange
 
 VECTOR_BYTES = 64
-# Target parents that share a table in registers: 2 GROUP sums, and one load of a table for each.
-GROUP = 6
-PRODUCTS = 27
+# Target parents that share tables in registers: with one output at a time, and with three.
+GROUP, GROUP_THREE = 8, 3
 
 
 class _Vectors:
@@ -47,7 +45,9 @@ class _Vectors:
         self.builder.store(value, self._pointer(data, offset), align=self._align)
 
     def broadcast(self, data: Any, offset: Any) -> Any:
-        scalar = self.builder.load(self.builder.gep(data, [offset]))
+        return self.spread(self.builder.load(self.builder.gep(data, [offset])))
+
+    def spread(self, scalar: Any) -> Any:
         undefined = ir.Constant(self.type, ir.Undefined)
         first = ir.Constant(ir.IntType(32), 0)
         single = self.builder.insert_element(undefined, scalar, first)
@@ -92,8 +92,13 @@ def _data(context: Any, builder: Any, array_type: Any, value: Any) -> Any:
     return context.make_array(array_type)(context, builder, value).data
 
 
-def _products(targets: int, outputs: int) -> Any:
-    """Make the inner loop of the transfer for this many targets and outputs at a time."""
+def _products(targets: int, outputs: int, onto: bool = False) -> Any:
+    """Make the inner loop of the transfer for this many targets and outputs at a time.
+
+    onto: the sums are added to what is there. A single sum is split in two, as its additions would
+    wait for each other.
+    """
+    split = targets * outputs == 1
 
     @intrinsic
     def sums(
@@ -124,7 +129,7 @@ def _products(targets: int, outputs: int) -> Any:
             width = number(vectors.lanes)
             total = [
                 [
-                    [cgutils.alloca_once_value(builder, vectors.zero) for _ in range(2)]
+                    [cgutils.alloca_once_value(builder, vectors.zero) for _ in range(4)]
                     for _ in range(outputs)
                 ]
                 for _ in range(targets)
@@ -151,19 +156,27 @@ def _products(targets: int, outputs: int) -> Any:
                         K_re = vectors.load(k_data, here)
                         K_im = vectors.load(k_data, builder.add(here, width))
                         for g in range(targets):
-                            re, im = (builder.load(t) for t in total[g][i])
-                            re = vectors.add_product(K_re, M_re[g], re)
-                            im = vectors.add_product(K_re, M_im[g], im)
-                            re = vectors.subtract_product(K_im, M_im[g], re)
-                            im = vectors.add_product(K_im, M_re[g], im)
-                            builder.store(re, total[g][i][0])
-                            builder.store(im, total[g][i][1])
+                            second = 2 if split else 0
+                            terms = (
+                                (vectors.add_product, K_re, M_re[g], 0),
+                                (vectors.add_product, K_re, M_im[g], 1),
+                                (vectors.subtract_product, K_im, M_im[g], second),
+                                (vectors.add_product, K_im, M_re[g], second + 1),
+                            )
+                            for add, a, b, part in terms:
+                                old = builder.load(total[g][i][part])
+                                builder.store(add(a, b, old), total[g][i][part])
             for g in range(targets):
                 row_start = builder.add(l_base, builder.mul(l_stride, number(g)))
                 for i in range(outputs):
                     for part in range(2):
                         here = builder.add(row_start, number((2 * i + part) * vectors.lanes))
-                        vectors.store(builder.load(total[g][i][part]), l_data, here)
+                        value = builder.load(total[g][i][part])
+                        if split:
+                            value = vectors.add(value, builder.load(total[g][i][part + 2]))
+                        if onto:
+                            value = vectors.add(value, vectors.load(l_data, here))
+                        vectors.store(value, l_data, here)
             return context.get_dummy_value()
 
         return types.void(*arguments), generate
@@ -171,9 +184,8 @@ def _products(targets: int, outputs: int) -> Any:
     return sums
 
 
-_sums_group = _products(GROUP, 1)
-_sums_one = _products(1, 1)
-_sums_three = _products(1, 3)
+_sums_group, _sums_group_three = _products(GROUP, 1), _products(GROUP_THREE, 3)
+_add_sums_one, _add_sums_three = _products(1, 1, onto=True), _products(1, 3, onto=True)
 
 
 def _tile(rows: int, columns: int) -> Any:
@@ -278,8 +290,7 @@ def _combine(typingctx: Any, x: Any, real: Any, r0: Any, y: Any, complex_: Any, 
         x_data, r_data, y_data, c_data = (
             _data(context, builder, signature.args[i], args[i]) for i in (0, 1, 3, 4)
         )
-        load, offsets = _offset_reader(builder)
-        r = [vectors.load(x_data, offsets(r_data, args[2], i)) for i in range(8)]
+        r = [vectors.load(x_data, _integer(builder, r_data, args[2], i)) for i in range(8)]
         add, sub = vectors.add, vectors.subtract
 
         def plus_minus(a: Any, b: Any) -> tuple[Any, Any]:
@@ -289,15 +300,13 @@ def _combine(typingctx: Any, x: Any, real: Any, r0: Any, y: Any, complex_: Any, 
                 (sub(a[0], b[1]), add(a[1], b[0])),
             )
 
-        # The imaginary part is minus the sum with sin: kept in `minus`, and turned at the end.
-        minus = vectors.subtract
-        parts = [(r[2 * i], minus(vectors.zero, r[2 * i + 1])) for i in range(4)]
+        parts = [(r[2 * i], sub(vectors.zero, r[2 * i + 1])) for i in range(4)]
         c_plus, c_minus = plus_minus(parts[0], parts[1])
         s_plus, s_minus = plus_minus(parts[2], parts[3])
         pp, mp = plus_minus(c_plus, s_plus)
         pm, mm = plus_minus(c_minus, s_minus)
         for i, value in enumerate((pp, pm, mp, mm)):
-            here = offsets(c_data, args[5], i)
+            here = _integer(builder, c_data, args[5], i)
             vectors.store(value[0], y_data, here)
             width = ir.Constant(here.type, vectors.lanes)
             vectors.store(value[1], y_data, builder.add(here, width))
@@ -316,10 +325,9 @@ def _separate(typingctx: Any, y: Any, complex_: Any, c0: Any, x: Any, real: Any,
         y_data, c_data, x_data, r_data = (
             _data(context, builder, signature.args[i], args[i]) for i in (0, 1, 3, 4)
         )
-        load, offsets = _offset_reader(builder)
         values = []
         for i in range(4):
-            here = offsets(c_data, args[2], i)
+            here = _integer(builder, c_data, args[2], i)
             width = ir.Constant(here.type, vectors.lanes)
             values.append(
                 (vectors.load(y_data, here), vectors.load(y_data, builder.add(here, width)))
@@ -337,20 +345,17 @@ def _separate(typingctx: Any, y: Any, complex_: Any, c0: Any, x: Any, real: Any,
         c_minus, s_minus = transposed(pm, mm)
         parts = [*transposed(c_plus, c_minus), *transposed(s_plus, s_minus)]
         for i, (re, im) in enumerate(parts):
-            vectors.store(re, x_data, offsets(r_data, args[5], 2 * i))
+            vectors.store(re, x_data, _integer(builder, r_data, args[5], 2 * i))
             opposite = vectors.subtract(vectors.zero, im)
-            vectors.store(opposite, x_data, offsets(r_data, args[5], 2 * i + 1))
+            vectors.store(opposite, x_data, _integer(builder, r_data, args[5], 2 * i + 1))
         return context.get_dummy_value()
 
     return types.void(*arguments), generate
 
 
-def _offset_reader(builder: Any) -> Any:
-    def offset(data: Any, base: Any, i: int) -> Any:
-        place = builder.add(base, ir.Constant(base.type, i))
-        return builder.load(builder.gep(data, [place]))
-
-    return builder.load, offset
+def _integer(builder: Any, data: Any, base: Any, i: int) -> Any:
+    """data[base + i]."""
+    return builder.load(builder.gep(data, [builder.add(base, ir.Constant(base.type, i))]))
 
 
 @intrinsic
@@ -372,6 +377,56 @@ def _transpose(typingctx: Any, x: Any, x0: Any, x_row: Any, y: Any, y0: Any, y_r
         return context.get_dummy_value()
 
     return types.void(x, n, n, y, n, n), generate
+
+
+@intrinsic
+def _copy_transposed(
+    typingctx: Any, x: Any, x0: Any, rows: Any, first: Any, y: Any, y0: Any
+) -> Any:
+    """y[i, j] = x[rows[first + j] + x0 + i] for a square of lanes x lanes numbers."""
+    n = types.intp
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        vectors = _Vectors(context, builder, x)
+        x_data, row_data, y_data = (
+            _data(context, builder, signature.args[i], args[i]) for i in (0, 2, 4)
+        )
+        columns = []
+        for k in range(vectors.lanes):
+            row = _integer(builder, row_data, args[3], k)
+            columns.append(vectors.load(x_data, builder.add(row, args[1])))
+        for k, row in enumerate(vectors.transpose(columns)):
+            place = builder.add(args[5], ir.Constant(args[5].type, k * vectors.lanes))
+            vectors.store(row, y_data, place)
+        return context.get_dummy_value()
+
+    return types.void(x, n, rows, n, y, n), generate
+
+
+@intrinsic
+def _add_transposed(
+    typingctx: Any, x: Any, x0: Any, scale: Any, y: Any, y0: Any, rows: Any, first: Any
+) -> Any:
+    """y[rows[first + j] + y0 + i] += scale x[x0 + i lanes + j] for a square of numbers."""
+    n = types.intp
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        vectors = _Vectors(context, builder, x)
+        x_data, y_data, row_data = (
+            _data(context, builder, signature.args[i], args[i]) for i in (0, 3, 5)
+        )
+        factor = vectors.spread(args[2])
+        columns = []
+        for k in range(vectors.lanes):
+            place = builder.add(args[1], ir.Constant(args[1].type, k * vectors.lanes))
+            columns.append(vectors.load(x_data, place))
+        for k, column in enumerate(vectors.transpose(columns)):
+            here = builder.add(_integer(builder, row_data, args[6], k), args[4])
+            old = vectors.load(y_data, here)
+            vectors.store(vectors.add_product(factor, column, old), y_data, here)
+        return context.get_dummy_value()
+
+    return types.void(x, n, x.dtype, y, n, rows, n), generate
 
 
 @jit_threads
@@ -410,11 +465,10 @@ def _transform_rows(
     flat_z, flat = matrix_z.reshape(-1), matrix.reshape(-1)
     b, c, d, zero = places
     _gather(values, rows, first, size * size * size, work, lanes)
-    for xy in range(size * size):
-        _multiply(
-            flat_z, 0, n_z, size, work, xy * size * lanes, lanes, 0,
-            work, d + xy * n_z * lanes, lanes, 0, 1,
-        )  # fmt: skip
+    _multiply(
+        flat_z, 0, n_z, size, work, 0, lanes, size * lanes,
+        work, d, lanes, n_z * lanes, size * size,
+    )  # fmt: skip
     for x in range(size):
         _multiply(
             flat, 0, n, size, work, d + x * size * n_z * lanes, n_z * lanes, lanes,
@@ -437,9 +491,12 @@ def _transform_rows(
 @jit
 def _gather(values, rows, first, count, work, lanes):
     """work[node, lane] = value of the row of the lane at the node."""
+    whole = count - count % lanes
+    for node in range(0, whole, lanes):
+        _copy_transposed(values, node, rows, first, work, node * lanes)
     for lane in range(lanes):
         start = rows[first + lane]
-        for node in range(count):
+        for node in range(whole, count):
             work[node * lanes + lane] = values[start + node]
 
 
@@ -489,33 +546,78 @@ def _restore_rows(
             flat, 0, size, n, work, b + x * n * n_z * lanes, n_z * lanes, lanes,
             work, d + x * size * n_z * lanes, n_z * lanes, lanes, n_z,
         )  # fmt: skip
-    for xy in range(size * size):
-        _multiply(
-            flat_z, 0, size, n_z, work, d + xy * n_z * lanes, lanes, 0,
-            work, xy * size * lanes, lanes, 0, 1,
-        )  # fmt: skip
+    _multiply(
+        flat_z, 0, size, n_z, work, d, lanes, n_z * lanes,
+        work, 0, lanes, size * lanes, size * size,
+    )  # fmt: skip
+    _scatter(work, size * size * size, lanes, scale, rows, first, used, values)
+
+
+@jit
+def _scatter(work, count, lanes, scale, rows, first, used, values):
+    """Add scale work[node, lane] to the row of the lane at the node."""
+    whole = count - count % lanes if first + lanes <= used else 0
+    for node in range(0, whole, lanes):
+        _add_transposed(work, node * lanes, scale, values, node, rows, first)
     for lane in range(min(lanes, used - first)):
         start = rows[first + lane]
-        for node in range(size * size * size):
+        for node in range(whole, count):
             values[start + node] += scale * work[node * lanes + lane]
 
 
-@intrinsic
-def _add_vectors(typingctx: Any, x: Any, x0: Any, y: Any, y0: Any, count: Any) -> Any:
-    """y += x for this many vectors."""
-    n = types.intp
+def _parents_to_children(count: int, gather: bool) -> Any:
+    """Make the sums of `count` pairs of children along z, or their transpose."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vectors = _Vectors(context, builder, x)
-        x_data, y_data = _data(context, builder, x, args[0]), _data(context, builder, y, args[2])
-        with cgutils.for_range(builder, args[4], intp=args[4].type) as k:
-            shift = builder.mul(k.index, ir.Constant(args[4].type, vectors.lanes))
-            here = builder.add(args[3], shift)
-            term = vectors.load(x_data, builder.add(args[1], shift))
-            vectors.store(vectors.add(vectors.load(y_data, here), term), y_data, here)
-        return context.get_dummy_value()
+    @intrinsic
+    def move(
+        typingctx: Any, x: Any, x0: Any, children: Any, c0: Any, order: Any, o0: Any, y: Any,
+        y0: Any, stride: Any, vectors_each: Any,
+    ) -> Any:  # fmt: skip
+        """Children are at x0 + children[c0 + order[o0 + 2 k + upper]], k < count.
 
-    return types.void(x, n, y, n, n), generate
+        Gather: y[y0 + (0, 1, 2) stride] = lower + upper, lower, upper, summed over k.
+        Else lower += y_0 + y_2, upper += y_0 + y_1 with the same y, for each k.
+        """
+        n = types.intp
+
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            v = _Vectors(context, builder, x)
+            x_data, c_data, o_data, y_data = (
+                _data(context, builder, signature.args[i], args[i]) for i in (0, 2, 4, 6)
+            )
+            boxes = []
+            for k in range(2 * count):
+                octant = builder.add(args[3], _integer(builder, o_data, args[5], k))
+                boxes.append(builder.add(args[1], builder.load(builder.gep(c_data, [octant]))))
+            products = [
+                builder.add(args[7], builder.mul(args[8], ir.Constant(args[8].type, k)))
+                for k in range(3)
+            ]
+            with cgutils.for_range(builder, args[9], intp=args[9].type) as loop:
+                shift = builder.mul(loop.index, ir.Constant(args[9].type, v.lanes))
+                at = [builder.add(box, shift) for box in boxes]
+                to = [builder.add(product, shift) for product in products]
+                if gather:
+                    lower, upper = (v.load(x_data, at[k]) for k in range(2))
+                    for k in range(1, count):
+                        lower = v.add(lower, v.load(x_data, at[2 * k]))
+                        upper = v.add(upper, v.load(x_data, at[2 * k + 1]))
+                    for place, value in zip(to, (v.add(lower, upper), lower, upper), strict=True):
+                        v.store(value, y_data, place)
+                else:
+                    both, first, second = (v.load(y_data, place) for place in to)
+                    terms = (v.add(both, second), v.add(both, first))
+                    for k in range(2 * count):
+                        v.store(v.add(v.load(x_data, at[k]), terms[k % 2]), x_data, at[k])
+            return context.get_dummy_value()
+
+        return types.void(x, n, children, n, order, n, y, n, n, n), generate
+
+    return move
+
+
+_gather_1, _gather_2, _gather_4 = (_parents_to_children(k, True) for k in (1, 2, 4))
+_spread_1, _spread_2, _spread_4 = (_parents_to_children(k, False) for k in (1, 2, 4))
 
 
 @jit
@@ -544,32 +646,35 @@ def _expand(tables, t0, size, lanes, stored, parity, full):
 @jit_threads
 def translate_pairs(
     tables, table_stride, table_size, lanes, stored, parity, scratch, n_blocks, spectra,
-    spectra_stride, steps, start, entry, n_in, n_out, local, local_stride,
+    spectra_stride, steps, start, target, entry, n_in, n_out, local, local_stride,
 ):  # fmt: skip
     """Spectra of locals, target by target: L_t = sum over the sources s of t of K_v M_s.
 
     tables : flat [block][stored vector][component][re, im][lanes], table_size numbers a vector
     steps : flat, (offset of the vector in the expanded tables, offset of the source) of each pair
-    start : (targets + 1,) first pair of each target
+    start, target : pairs start[k] : start[k + 1] belong to the target at the offset target[k];
+        ordered so that one after another use tables of few vectors
     entry : (n_out n_in,) offset of each entry in a table
     """
     workers = scratch.shape[0]
     for worker in prange(workers):
         full = scratch[worker]
         for block in range(n_blocks * worker // workers, n_blocks * (worker + 1) // workers):
+            m0, l_first = block * spectra_stride, block * local_stride
             _expand(tables, block * table_stride, table_size, lanes, stored, parity, full)
-            for t in range(len(start) - 1):
-                l0 = block * local_stride + t * n_out * 2 * lanes
+            local[l_first : l_first + local_stride] = 0.0
+            for k in range(len(target)):
+                l0 = l_first + target[k]
                 i = 0
                 while i + 3 <= n_out:
-                    _sums_three(
-                        full, 0, spectra, block * spectra_stride, steps, start[t], start[t + 1],
+                    _add_sums_three(
+                        full, 0, spectra, m0, steps, start[k], start[k + 1],
                         entry, i * n_in, n_in, local, l0 + 2 * lanes * i, 0,
                     )  # fmt: skip
                     i += 3
                 while i < n_out:
-                    _sums_one(
-                        full, 0, spectra, block * spectra_stride, steps, start[t], start[t + 1],
+                    _add_sums_one(
+                        full, 0, spectra, m0, steps, start[k], start[k + 1],
                         entry, i * n_in, n_in, local, l0 + 2 * lanes * i, 0,
                     )  # fmt: skip
                     i += 1
@@ -606,22 +711,11 @@ def _differences(full, size, directions, part, products):
             products[at : at + size] = part[w * size : (w + 1) * size]
 
 
-@jit
-def _has(w, octant, first, second):
-    """Whether the product w has the child: all where the digit is 0, else one half."""
-    for stride, bit in ((9, 4), (3, 2), (1, 1)):
-        digit = w // stride % 3
-        upper = (octant & bit) != 0
-        if (digit == first and upper) or (digit == second and not upper):
-            return False
-    return True
-
-
 @jit_threads
 def translate_families(
     tables, table_stride, table_size, lanes, stored, parity, directions, scratch, n_blocks,
-    spectra, spectra_stride, source_children, steps, start, entry, n_in, n_out, local,
-    local_stride, target_children, places,
+    spectra, spectra_stride, source_children, steps, start, group, entry, n_in, n_out, local,
+    local_stride, target_children, order, places,
 ):  # fmt: skip
     """Spectra of locals, the eight children of a box together: 27 products for 64 pairs.
 
@@ -630,14 +724,17 @@ def translate_families(
     Pairs too close to interact have zero tables, which keeps the structure.
 
     directions : (k, 3) differences of parents; steps : flat rows of (offset of the direction in
-    the tables of a product, offsets of GROUP source parents); start : (groups + 1,)
-    source_children (parents, 8): number of box in spectra or -1; target_children likewise, the
-    parents of a group one after another
+    the tables of a product, offsets of `group` source parents); start : (groups + 1,)
+    source_children : (8 parents,) offset in a block of the spectra, of zeros where there is none
+    target_children : likewise in local, parents of a group one after another
+    order : (2, 9, 8) octants of sources, of targets, for the products (wx, wy), lower z first
     """
     workers = scratch.shape[0]
-    groups, parents = len(start) - 1, source_children.shape[0]
+    groups, parents = len(start) - 1, len(source_children) // 8
     out_size, in_size = n_out * 2 * lanes, n_in * 2 * lanes
-    count = directions.shape[0]
+    in_stride, out_stride = (parents + 1) * in_size, group * out_size
+    product_size = directions.shape[0] * table_size
+    octants = order.reshape(-1)
     for worker in prange(workers):
         work = scratch[worker]
         full = work[places[0] : places[1]]
@@ -645,36 +742,62 @@ def translate_families(
         products = work[places[2] : places[3]]
         sources = work[places[3] : places[4]]
         sums = work[places[4] : places[5]]
-        sources[parents * in_size : (parents + 1) * in_size] = 0.0
+        for k in range(3):
+            sources[(k + 1) * in_stride - in_size : (k + 1) * in_stride] = 0.0
         for block in range(n_blocks * worker // workers, n_blocks * (worker + 1) // workers):
             m0, l_first = block * spectra_stride, block * local_stride
             _expand(tables, block * table_stride, table_size, lanes, stored, parity, full)
             _differences(full, table_size, directions, part, products)
             local[l_first : l_first + local_stride] = 0.0
-            for w in range(PRODUCTS):
+            for w in range(9):
+                children = (2 - min(w // 3, 1)) * (2 - min(w % 3, 1))
+                from_, to = w * 8, 72 + w * 8
                 for p in range(parents):
-                    sources[p * in_size : (p + 1) * in_size] = 0.0
-                for octant in range(8):
-                    if not _has(w, octant, 1, 2):
-                        continue
-                    for p in range(parents):
-                        box = source_children[p, octant]
-                        if box >= 0:
-                            _add_vectors(
-                                spectra, m0 + box * in_size, sources, p * in_size, 2 * n_in
-                            )
-                for g in range(groups):
-                    for i in range(n_out):
-                        _sums_group(
-                            products, w * count * table_size, sources, 0, steps, start[g],
-                            start[g + 1], entry, i * n_in, n_in, sums, 2 * lanes * i, out_size,
+                    at = p * in_size
+                    if children == 4:
+                        _gather_4(
+                            spectra, m0, source_children, 8 * p, octants, from_, sources, at,
+                            in_stride, 2 * n_in,
                         )  # fmt: skip
-                    for octant in range(8):
-                        if not _has(w, octant, 2, 1):
-                            continue
-                        for k in range(GROUP):
-                            box = target_children[g * GROUP + k, octant]
-                            if box >= 0:
-                                _add_vectors(
-                                    sums, k * out_size, local, l_first + box * out_size, 2 * n_out
-                                )
+                    elif children == 2:
+                        _gather_2(
+                            spectra, m0, source_children, 8 * p, octants, from_, sources, at,
+                            in_stride, 2 * n_in,
+                        )  # fmt: skip
+                    else:
+                        _gather_1(
+                            spectra, m0, source_children, 8 * p, octants, from_, sources, at,
+                            in_stride, 2 * n_in,
+                        )  # fmt: skip
+                for g in range(groups):
+                    for z in range(3):
+                        table, m_z, l_z = (3 * w + z) * product_size, z * in_stride, z * out_stride
+                        if group == GROUP_THREE:
+                            for i in range(0, n_out, 3):
+                                _sums_group_three(
+                                    products, table, sources, m_z, steps, start[g], start[g + 1],
+                                    entry, i * n_in, n_in, sums, l_z + 2 * lanes * i, out_size,
+                                )  # fmt: skip
+                        else:
+                            for i in range(n_out):
+                                _sums_group(
+                                    products, table, sources, m_z, steps, start[g], start[g + 1],
+                                    entry, i * n_in, n_in, sums, l_z + 2 * lanes * i, out_size,
+                                )  # fmt: skip
+                    for k in range(group):
+                        p, at = 8 * (g * group + k), k * out_size
+                        if children == 4:
+                            _spread_4(
+                                local, l_first, target_children, p, octants, to, sums, at,
+                                out_stride, 2 * n_out,
+                            )  # fmt: skip
+                        elif children == 2:
+                            _spread_2(
+                                local, l_first, target_children, p, octants, to, sums, at,
+                                out_stride, 2 * n_out,
+                            )  # fmt: skip
+                        else:
+                            _spread_1(
+                                local, l_first, target_children, p, octants, to, sums, at,
+                                out_stride, 2 * n_out,
+                            )  # fmt: skip

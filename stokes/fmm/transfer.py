@@ -130,13 +130,22 @@ class FourierTransfer:
         sources, place = np.unique(np.asarray(source[start[0] : start[-1]]), return_inverse=True)
         vector = np.asarray(vector[start[0] : start[-1]], dtype=np.int64)
         bounds = np.append(start[busy], start[-1]) - start[0]
-        pairs = Pairs(level, sources, targets, bounds, place.reshape(-1), vector, None)
-        if cells is None or len(targets) == 0:
-            return pairs
-        families = _families(pairs, np.asarray(cells, dtype=np.int64))
-        if families is None or families.products >= _PAIR_COST * len(vector):
-            return pairs
-        return Pairs(level, sources, targets, bounds, pairs.place, vector, families)
+        target = np.repeat(np.arange(len(targets)), np.diff(bounds))
+        families = None
+        if cells is not None and len(targets) > 0:
+            group = kernels.GROUP_THREE if self.kernel.n_out % 3 == 0 else kernels.GROUP
+            at = np.asarray(cells, dtype=np.int64)
+            families = _families(at[sources], at[targets], vector, group)
+        if families is not None and families.products < _PAIR_COST * len(vector):
+            none = np.empty(0, dtype=np.int64)
+            return Pairs(level, sources, targets, none, none, none, none, families)
+        order = np.argsort(_CLUSTER[vector], kind="stable")
+        target, cluster = target[order], _CLUSTER[vector[order]]
+        first = np.flatnonzero(np.diff(cluster * len(targets) + target, prepend=-1))
+        return Pairs(
+            level, sources, targets, np.append(first, len(target)), target[first],
+            place.reshape(-1)[order], vector[order], None,
+        )  # fmt: skip
 
     def apply(self, pairs: Pairs, multipoles: NDArray, local: NDArray) -> None:
         """Add to the locals what the prepared pairs of a level give: see `add`."""
@@ -167,33 +176,45 @@ class FourierTransfer:
         workers = max(1, min(self.threads, last - first))
         common = (table[first * stride :], stride, size, lanes, self._stored, self._parity)
         M_stride, L_stride = spectra.total * 2 * lanes, result.total * 2 * lanes
-        families = pairs.families
-        if families is None:
-            full = _aligned_rows(workers, _VECTORS * size, self.dtype)
-            steps = np.stack([pairs.vector * size, pairs.place * kernel.n_in * 2 * lanes], 1)
-            kernels.translate_pairs.using(self.threads)(
-                *common, full, last - first, M, M_stride, steps.reshape(-1), pairs.start,
-                self._entry, kernel.n_in, kernel.n_out, L, L_stride,
-            )  # fmt: skip
+        if pairs.families is not None:
+            self._translate_families(
+                pairs.families, common, last - first, M, M_stride, spectra, L, L_stride, result
+            )
             return
+        full = _aligned_rows(workers, _VECTORS * size, self.dtype)
+        in_size, out_size = kernel.n_in * 2 * lanes, kernel.n_out * 2 * lanes
+        steps = np.stack([pairs.vector * size, pairs.place * in_size], 1).reshape(-1)
+        kernels.translate_pairs.using(self.threads)(
+            *common, full, last - first, M, M_stride, steps, pairs.start,
+            pairs.target * out_size, self._entry, kernel.n_in, kernel.n_out, L, L_stride,
+        )  # fmt: skip
+
+    def _translate_families(
+        self, families, common, blocks, M, M_stride, spectra, L, L_stride, result
+    ):
+        lanes, kernel = self._lanes, self.kernel
+        size, group = kernel.n_unique * 2 * lanes, families.group
+        in_size, out_size = kernel.n_in * 2 * lanes, kernel.n_out * 2 * lanes
         parents = len(families.source_children)
-        in_size = kernel.n_in * 2 * lanes
         sizes = [
             _VECTORS * size,
             27 * size,
             27 * len(families.directions) * size,
-            (parents + 1) * in_size,
-            kernels.GROUP * kernel.n_out * 2 * lanes,
+            3 * (parents + 1) * in_size,
+            3 * group * out_size,
         ]
         places = np.concatenate([[0], np.cumsum(sizes)])
-        work = _aligned_rows(workers, places[-1], self.dtype)
-        steps = families.steps * np.array([size] + kernels.GROUP * [in_size])
+        work = _aligned_rows(max(1, min(self.threads, blocks)), places[-1], self.dtype)
+        steps = families.steps * np.array([size] + group * [in_size])
         stored = self._stored if families.neighbours else np.where(_NEAR, -1000, self._stored)
-        common = (*common[:4], stored, self._parity)
+        # Offsets of the children in a block; missing ones are the box of zeros.
+        M.reshape(-1, M_stride)[:, spectra.none * 2 * lanes :] = 0.0
+        from_ = _offsets(families.source_children, in_size, spectra.none * 2 * lanes)
+        to = _offsets(families.target_children, out_size, result.none * 2 * lanes)
         kernels.translate_families.using(self.threads)(
-            *common, families.directions, work, last - first, M, M_stride,
-            families.source_children, steps.reshape(-1), families.start, self._entry,
-            kernel.n_in, kernel.n_out, L, L_stride, families.target_children, places,
+            *common[:4], stored, common[5], families.directions, work, blocks, M, M_stride, from_,
+            steps.reshape(-1), families.start, group, self._entry, kernel.n_in, kernel.n_out, L,
+            L_stride, to, _ORDER, places,
         )  # fmt: skip
 
     @property
@@ -222,14 +243,17 @@ class FourierTransfer:
 class Pairs:
     """Pairs of one level in the order of the loops over them.
 
-    sources, targets : boxes that occur; start, place, vector : the pairs of each target by the
-    place of the source in `sources`; families : the same by families of siblings, where it pays
+    sources, targets : boxes that occur. Then either, by families of siblings, where it pays,
+    families
+    or runs of pairs of one target (its place in `targets`), their tables a few neighbours:
+    start : (runs + 1,), target : (runs,), place of the source in `sources`, vector : (pairs,)
     """
 
     level: int
     sources: NDArray
     targets: NDArray
     start: NDArray
+    target: NDArray
     place: NDArray
     vector: NDArray
     families: _Families | None
@@ -237,12 +261,13 @@ class Pairs:
 
 @dataclass(frozen=True)
 class _Families:
-    """Pairs of parents, GROUP targets at a time.
+    """Pairs of parents, `group` targets at a time.
 
-    steps (rows, 1 + GROUP): direction, then source parent of each target; the number of parents
+    steps (rows, 1 + group): direction, then source parent of each target; the number of parents
     stands for none. products: those of a frequency and an entry, for the choice.
     """
 
+    group: int
     directions: NDArray
     neighbours: bool
     source_children: NDArray
@@ -254,14 +279,29 @@ class _Families:
 
 _OFFSETS = np.stack(np.meshgrid(*3 * [np.arange(-3, 4)], indexing="ij"), -1).reshape(-1, 3)
 _NEAR = np.abs(_OFFSETS).max(axis=1) <= 1
+# Which of the 27 regions before, about and behind the target in each direction a source is in.
+_CLUSTER = (np.sign(_OFFSETS) * (np.abs(_OFFSETS) > 1) + 1) @ np.array([9, 3, 1])
 
 
-def _families(pairs: Pairs, cells: NDArray) -> _Families | None:
+def _octants(first: int, second: int) -> list[list[int]]:
+    """Octants (x, y, z bits) in the products (wx, wy): all for digit 0, lower for `first`."""
+    halves = [(0, 1), None, None]
+    halves[first], halves[second] = (0,), (1,)
+    rows = []
+    for w in range(9):
+        row = [4 * x + 2 * y + z for x in halves[w // 3] for y in halves[w % 3] for z in (0, 1)]
+        rows.append(row + (8 - len(row)) * [0])
+    return rows
+
+
+_ORDER = np.array([_octants(1, 2), _octants(2, 1)])
+
+
+def _families(sources: NDArray, targets: NDArray, vector: NDArray, group: int) -> _Families | None:
     """Group pairs by parents; None if they are not all there are between their families."""
-    neighbours = bool(_NEAR[pairs.vector].any())
+    neighbours = bool(_NEAR[vector].any())
     offsets = np.stack(np.meshgrid(*3 * [np.arange(-1, 2)], indexing="ij"), -1).reshape(-1, 3)
     directions = offsets if neighbours else offsets[np.any(offsets != 0, axis=1)]
-    sources, targets = cells[pairs.sources], cells[pairs.targets]
     lowest = np.minimum(sources.min(axis=0), targets.min(axis=0)) >> 1
     source_parent, source_children = _parents(sources, lowest)
     target_parent, target_children = _parents(targets, lowest)
@@ -271,21 +311,25 @@ def _families(pairs: Pairs, cells: NDArray) -> _Families | None:
     place = order[np.minimum(place, len(order) - 1)]
     none = len(source_parent)
     neighbour = np.where(source_parent[place] == wanted, place, none)
-    if _count(source_children, target_children, neighbour, directions, neighbours) != len(
-        pairs.vector
-    ):
+    count = _count(source_children, target_children, neighbour, directions, neighbours)
+    if count != len(vector):
         return None
-    padding = -len(target_parent) % kernels.GROUP
+    padding = -len(target_parent) % group
     neighbour = np.pad(neighbour, ((0, padding), (0, 0)), constant_values=none)
     target_children = np.pad(target_children, ((0, padding), (0, 0)), constant_values=-1)
-    grouped = neighbour.reshape(-1, kernels.GROUP, len(directions))
-    group, direction = np.nonzero((grouped != none).any(axis=1))
-    steps = np.concatenate([direction[:, None], grouped[group, :, direction]], axis=1)
-    start = np.searchsorted(group, np.arange(len(grouped) + 1))
-    products = 27 * kernels.GROUP * len(steps)
+    grouped = neighbour.reshape(-1, group, len(directions))
+    number, direction = np.nonzero((grouped != none).any(axis=1))
+    steps = np.concatenate([direction[:, None], grouped[number, :, direction]], axis=1)
+    start = np.searchsorted(number, np.arange(len(grouped) + 1))
+    products = 27 * group * len(steps)
     return _Families(
-        directions, neighbours, source_children, target_children, steps, start, products
+        group, directions, neighbours, source_children, target_children, steps, start, products
     )
+
+
+def _offsets(children: NDArray, size: int, none: int) -> NDArray:
+    """Offsets (8 parents,) of children from their numbers."""
+    return np.where(children < 0, none, children * size).reshape(-1)
 
 
 def _code(cells: NDArray) -> NDArray:
@@ -467,6 +511,7 @@ class _Rows:
     """Rows of components of boxes: a vector's lanes at a time, the last one filled up.
 
     offsets : of each row in an array (boxes, components, length)
+    none : first row, after all others, of a box that stands for missing ones
     """
 
     def __init__(
@@ -476,7 +521,8 @@ class _Rows:
         offsets = number.reshape(-1) * length
         self.used = len(offsets)
         self.offsets = np.pad(offsets, (0, -len(offsets) % lanes), mode="edge")
-        self.total = len(self.offsets)
+        self.none = len(self.offsets)
+        self.total = self.none + (0 if exact else components)
 
 
 def _aligned(count: int, dtype: np.dtype) -> NDArray:
