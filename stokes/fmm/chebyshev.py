@@ -89,8 +89,17 @@ class MatrixTransfer(ABC):
         self.dtype = np.dtype(dtype)
         self.threads = threads
         self._edges = np.asarray(edges, dtype=np.float64)
+        self._orbits = orbits(
+            transfer_vectors(neighbours=True),
+            grid.nodes,
+            kernel.rotate if self._by_symmetry(kernel) else None,
+            kernel.n_in,
+            kernel.n_out,
+        )
         self._tables = {
-            level: self._build(_Family(kernel, grid, edge, transfer_vectors(neighbours)))
+            level: self._build(
+                _Family(kernel, grid, edge, transfer_vectors(neighbours), self._orbits)
+            )
             for level, edge, neighbours in self._levels(admissibility == "smooth")
         }
 
@@ -108,6 +117,7 @@ class MatrixTransfer(ABC):
         vector: np.ndarray,
         targets: np.ndarray,
         local: np.ndarray,
+        cells: np.ndarray | None = None,
     ) -> None:
         """Add to the locals of target boxes what their source boxes of one level give.
 
@@ -115,15 +125,47 @@ class MatrixTransfer(ABC):
         start : (k + 1,) pairs start[t] : start[t + 1] belong to the box targets[t]
         source, vector : (pairs,) box of the source, transfer vector 0..342
         """
-        start = np.asarray(start)
-        pairs = slice(start[0], start[-1])
-        if start[0] == start[-1]:
+        self.apply(self.prepare(level, start, source, vector, targets, cells), multipoles, local)
+
+    def prepare(
+        self,
+        level: int,
+        start: np.ndarray,
+        source: np.ndarray,
+        vector: np.ndarray,
+        targets: np.ndarray,
+        cells: np.ndarray | None = None,
+    ) -> Pairs:
+        """Order the pairs of a level (arguments of `add`) for any number of calls of `apply`.
+
+        `cells` is of no use here: every pair is taken by itself.
+        """
+        start, targets = np.asarray(start), np.asarray(targets)
+        wanted = np.linspace(start[0], start[-1], self.threads + 1)
+        cuts = np.searchsorted(start, wanted)
+        parts = tuple(
+            _sorted(self._operator_of(), start[a : b + 1], source, vector, targets[a:b])
+            for a, b in pairwise(cuts)
+            if start[a] < start[b]
+        )
+        return Pairs(level, parts)
+
+    def apply(self, pairs: Pairs, multipoles: np.ndarray, local: np.ndarray) -> None:
+        """Add to the locals what the multipoles give them over the prepared pairs of a level."""
+        if not pairs.parts:
             return
-        table, scale = self._table(level)
+        table, scale = self._table(pairs.level)
         expansions = multipoles.reshape(len(multipoles), self.kernel.n_in, -1)
         result = local.reshape(len(local), self.kernel.n_out, -1)
-        lists = _Pairs(start - start[0], source[pairs], vector[pairs], np.asarray(targets))
-        self._apply(table, scale, expansions, lists, result)
+        self._apply(table, scale, expansions, pairs.parts, result)
+
+    def _by_symmetry(self, kernel: Kernel) -> bool:
+        """Whether operators are obtained from those of the cone."""
+        return is_symmetric(kernel)
+
+    def _operator_of(self) -> np.ndarray:
+        """(343,) The vector of the operator that each vector's pairs are multiplied with."""
+        return np.arange(VECTORS)
 
     def _levels(self, smooth: bool) -> Iterator[tuple[int, float, bool]]:
         """Levels with tables of their own: (level, edge, whether neighbours are among them)."""
@@ -151,20 +193,19 @@ class MatrixTransfer(ABC):
     def _apply(
         self,
         table: _Table,
-        scale: float,
+        scale: np.floating,
         multipoles: np.ndarray,
-        pairs: _Pairs,
+        parts: tuple[_Part, ...],
         local: np.ndarray,
     ) -> None:
-        """local += scale K multipoles over the pairs of a level."""
+        """local += scale K multipoles over the parts, which share no target."""
 
-    def _in_threads(self, work: Callable[[_Pairs], None], pairs: _Pairs) -> None:
-        """Do the work on parts of the pairs that share no target."""
-        if self.threads == 1:
-            work(pairs)
+    def _in_threads(self, work: Callable[[_Part], None], parts: tuple[_Part, ...]) -> None:
+        if len(parts) == 1:
+            work(parts[0])
             return
-        with ThreadPoolExecutor(self.threads) as pool:
-            list(pool.map(work, pairs.parts(self.threads)))
+        with ThreadPoolExecutor(len(parts)) as pool:
+            list(pool.map(work, parts))
 
 
 class DenseTransfer(MatrixTransfer):
@@ -177,18 +218,19 @@ class DenseTransfer(MatrixTransfer):
         tables = {v: _contiguous(family.matrix(v).T, self.dtype) for v in family.vectors}
         return _Table(tables, sum(matrix.nbytes for matrix in tables.values()))
 
-    def _apply(self, table, scale, multipoles, pairs, local):
+    def _apply(self, table, scale, multipoles, parts, local):
         operators, width = table.data, multipoles.shape[1] * multipoles.shape[2]
         rows, out = multipoles.reshape(-1, width), local.reshape(len(local), -1)
 
-        def work(part: _Pairs) -> None:
+        def work(part: _Part) -> None:
             given = np.empty((_PAIRS, width), self.dtype)
-            for v, sources, targets in part.groups(part.vector):
+            for v, some in part.groups:
+                sources, targets = part.source[some], part.targets[part.row[some]]
                 block = given[: len(sources)]
                 gather_rows(rows, sources, block)
-                scatter_rows(block @ operators[v], targets, self.dtype.type(scale), out)
+                scatter_rows(block @ operators[v], targets, scale, out)
 
-        self._in_threads(work, pairs)
+        self._in_threads(work, parts)
 
 
 class CompressedTransfer(MatrixTransfer):
@@ -234,24 +276,27 @@ class CompressedTransfer(MatrixTransfer):
         size = to_local.nbytes + from_multipole.nbytes + sum(c.nbytes for c in cores.values())
         return _Table((to_local, cores, from_multipole), size)
 
-    def _apply(self, table, scale, multipoles, pairs, local):
+    def _apply(self, table, scale, multipoles, parts, local):
         to_local, cores, from_multipole = table.data
-        first, last = pairs.source.min(), pairs.source.max() + 1
+        first = min(part.source.min() for part in parts)
+        last = max(part.source.max() for part in parts) + 1
         given = multipoles[first:last].reshape(last - first, -1) @ from_multipole
         out = local.reshape(len(local), -1)
 
-        def work(part: _Pairs) -> None:
-            row = np.arange(len(part.targets))
-            sums = np.zeros((len(row), len(to_local)), self.dtype)
+        def work(part: _Part) -> None:
+            count = len(part.targets)
+            sums = np.zeros((count, len(to_local)), self.dtype)
             block = np.empty((_PAIRS, given.shape[1]), self.dtype)
-            for v, sources, targets in part.on(row).groups(part.vector):
+            for v, some in part.groups:
+                sources = part.source[some]
                 gather_rows(given, sources - first, block[: len(sources)])
-                scatter_rows(block[: len(sources)] @ cores[v], targets, self.dtype.type(1), sums)
-            for k in range(0, len(row), _PAIRS):
+                values = block[: len(sources)] @ cores[v]
+                scatter_rows(values, part.row[some], self.dtype.type(1), sums)
+            for k in range(0, count, _PAIRS):
                 some = slice(k, k + _PAIRS)
-                scatter_rows(sums[some] @ to_local, part.targets[some], self.dtype.type(scale), out)
+                scatter_rows(sums[some] @ to_local, part.targets[some], scale, out)
 
-        self._in_threads(work, pairs)
+        self._in_threads(work, parts)
 
 
 class SymmetricTransfer(MatrixTransfer):
@@ -280,14 +325,17 @@ class SymmetricTransfer(MatrixTransfer):
     def ranks(self) -> dict[int, dict[int, int]]:
         """Rank of each stored operator by level (0 for all if homogeneous) and vector."""
         return {
-            level: {v: factors[0].shape[1] for v, factors in table.data[1].items()}
+            level: {v: factors[0].shape[1] for v, factors in table.data.items()}
             for level, table in self._tables.items()
         }
 
     def _build(self, family: _Family) -> _Table:
-        operators = {v: self._operator(family, v) for v in family.orbits.representatives}
+        operators = {v: self._operator(family, v) for v in family.representatives}
         size = sum(matrix.nbytes for factors in operators.values() for matrix in factors)
-        return _Table((family.orbits, operators), size)
+        return _Table(operators, size)
+
+    def _operator_of(self) -> np.ndarray:
+        return self._orbits.representative
 
     def _operator(self, family: _Family, v: int) -> tuple[np.ndarray, ...]:
         """Matrices whose product, applied from the right, is K_v^T: two factors or one."""
@@ -299,25 +347,26 @@ class SymmetricTransfer(MatrixTransfer):
             _contiguous(factors.left.T / family.weight_out, self.dtype),
         )
 
-    def _apply(self, table, scale, multipoles, pairs, local):
-        turn, operators = table.data
+    def _apply(self, table, scale, multipoles, parts, local):
+        turn, operators = self._orbits, table.data
         inward = (turn.node, turn.component_in, turn.sign_in.astype(self.dtype))
         outward = (turn.inverse, turn.component_out, turn.sign_out.astype(self.dtype))
 
-        def work(part: _Pairs) -> None:
+        def work(part: _Part) -> None:
             given = np.empty((_PAIRS, *multipoles.shape[1:]), self.dtype)
             shape = (-1, *local.shape[1:])
-            symmetry = turn.symmetry[part.vector]
-            for v, sources, targets, q in part.groups(turn.representative[part.vector], symmetry):
+            for v, some in part.groups:
+                sources, targets = part.source[some], part.targets[part.row[some]]
+                q = turn.symmetry[part.vector[some]]
                 block = given[: len(sources)]
                 gather_turned(multipoles, sources, q, *inward, block)
                 values = block.reshape(len(block), -1)
                 for factor in operators[v]:
                     values = values @ factor
                 values = values.reshape(shape)
-                scatter_turned(values, targets, q, *outward, self.dtype.type(scale), local)
+                scatter_turned(values, targets, q, *outward, scale, local)
 
-        self._in_threads(work, pairs)
+        self._in_threads(work, parts)
 
 
 def is_symmetric(kernel: Kernel) -> bool:
@@ -342,41 +391,50 @@ class _Table:
 
 
 @dataclass(frozen=True)
-class _Pairs:
-    """Pairs of boxes of one level, by target: start (k + 1,), targets (k,), others (pairs,)."""
+class Pairs:
+    """The pairs of boxes of one level, ordered by operator; a part for each thread."""
 
-    start: np.ndarray
+    level: int
+    parts: tuple[_Part, ...]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Pairs of some target boxes, those that share an operator in a row.
+
+    source, vector : (pairs,); row : (pairs,) of targets : (k,)
+    groups : (operator, slice of the pairs), at most _PAIRS of them each
+    """
+
     source: np.ndarray
     vector: np.ndarray
+    row: np.ndarray
     targets: np.ndarray
+    groups: tuple[tuple[int, slice], ...]
 
-    def on(self, targets: np.ndarray) -> _Pairs:
-        """The same pairs with other numbers for the targets."""
-        return _Pairs(self.start, self.source, self.vector, targets)
 
-    def parts(self, count: int) -> Iterator[_Pairs]:
-        """Up to `count` parts of about equally many pairs, cut between targets."""
-        wanted = np.linspace(0, self.start[-1], count + 1)
-        cuts = np.unique(np.searchsorted(self.start, wanted))
-        for a, b in pairwise(cuts):
-            pairs = slice(self.start[a], self.start[b])
-            start = self.start[a : b + 1] - self.start[a]
-            yield _Pairs(start, self.source[pairs], self.vector[pairs], self.targets[a:b])
+def _sorted(
+    operator: np.ndarray,
+    start: np.ndarray,
+    source: np.ndarray,
+    vector: np.ndarray,
+    targets: np.ndarray,
+) -> _Part:
+    """The pairs start[0] : start[-1] by operator; pairs of one operator keep their order.
 
-    def groups(self, key: np.ndarray, *more: np.ndarray) -> Iterator[tuple]:
-        """At most _PAIRS pairs of equal key at a time: key, sources, targets, more of them.
-
-        Within a key the pairs keep their order, so that the sums at a target do not depend on how
-        the targets are spread over threads.
-        """
-        target = np.repeat(self.targets, np.diff(self.start))
-        order = np.argsort(key.astype(np.int16), kind="stable")
-        ends = np.cumsum(np.bincount(key[order], minlength=VECTORS))
-        for v in np.flatnonzero(np.diff(ends, prepend=0)):
-            begin = ends[v - 1] if v else 0
-            for k in range(begin, ends[v], _PAIRS):
-                some = order[k : min(k + _PAIRS, ends[v])]
-                yield v, self.source[some], target[some], *(each[some] for each in more)
+    So the sums at a target do not depend on how the targets are spread over threads.
+    """
+    pairs = slice(start[0], start[-1])
+    key = operator[vector[pairs]].astype(np.int16)
+    order = np.argsort(key, kind="stable")
+    ends = np.cumsum(np.bincount(key, minlength=VECTORS))
+    groups = tuple(
+        (int(v), slice(k, min(k + _PAIRS, ends[v])))
+        for v in np.flatnonzero(np.diff(ends, prepend=0))
+        for k in range(ends[v - 1] if v else 0, ends[v], _PAIRS)
+    )
+    row = np.repeat(np.arange(len(targets), dtype=np.int32), np.diff(start))
+    return _Part(source[pairs][order], vector[pairs][order], row[order], targets, groups)
 
 
 class _Family:
@@ -386,7 +444,9 @@ class _Family:
     matrices weighted by W: diag(weight_out) K_v diag(weight_in).
     """
 
-    def __init__(self, kernel: Kernel, grid: Nodes, edge: float, vectors: np.ndarray) -> None:
+    def __init__(
+        self, kernel: Kernel, grid: Nodes, edge: float, vectors: np.ndarray, turns: Orbits
+    ) -> None:
         self.vectors = vectors
         self.shape = (kernel.n_out * grid.nodes**3, kernel.n_in * grid.nodes**3)
         self._kernel = kernel
@@ -396,8 +456,8 @@ class _Family:
         weight = _root_weights(grid)
         self.weight_out = np.tile(weight, kernel.n_out)
         self.weight_in = np.tile(weight, kernel.n_in)
-        rotation = kernel.rotate if is_symmetric(kernel) else None
-        self.orbits: Orbits = orbits(vectors, grid.nodes, rotation, kernel.n_in, kernel.n_out)
+        self._turns = turns
+        self.representatives = np.unique(turns.representative[vectors])
 
     def matrix(self, v: int) -> np.ndarray:
         """K_v without weights, a few rows of nodes at a time."""
@@ -435,10 +495,10 @@ class _Family:
 
     def compressed(self, eps: float) -> Iterator[tuple[int, LowRank]]:
         """Each vector with the factors of its weighted operator, in the order of the vectors."""
-        known = {v: self.low_rank(v, eps) for v in self.orbits.representatives}
+        known = {v: self.low_rank(v, eps) for v in self.representatives}
         for v in self.vectors:
-            factors = known[self.orbits.representative[v]]
-            rows, row_sign, columns, column_sign = self._turn(self.orbits.symmetry[v])
+            factors = known[self._turns.representative[v]]
+            rows, row_sign, columns, column_sign = self._turn(self._turns.symmetry[v])
             yield (
                 v,
                 LowRank(
@@ -449,7 +509,7 @@ class _Family:
 
     def _turn(self, q: int) -> tuple[np.ndarray, ...]:
         """Rows and columns, with signs, of the representative that make up the operator."""
-        turn, count = self.orbits, len(self._points)
+        turn, count = self._turns, len(self._points)
         rows = (turn.component_out[q][:, None] * count + turn.inverse[q]).ravel()
         row_sign = np.repeat(turn.sign_out[q], count)
         # component_in says which component each one of the representative comes from.
@@ -465,8 +525,8 @@ def _root_weights(grid: Nodes) -> np.ndarray:
     """Square roots of the quadrature weights of all nodes (N,), of mean square 1."""
     if grid.kind != "chebyshev":
         return np.ones(grid.nodes**3)
-    # integral of f over [-1, 1] ~ (pi / nodes) sum_a sqrt(1 - x_a^2) f(x_a)
-    w = np.sqrt(1.0 - np.asarray(grid.points) ** 2)
+    # integral of f over [-1, 1] ~ (pi / nodes) sum_a sin(t_a) f(cos(t_a))
+    w = np.sin(np.pi * (np.arange(grid.nodes) + 0.5) / grid.nodes)
     w = np.sqrt(w / w.mean())
     return np.einsum("a,b,c->abc", w, w, w).ravel()
 

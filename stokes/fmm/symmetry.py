@@ -91,11 +91,6 @@ class Orbits:
     component_out: np.ndarray
     sign_out: np.ndarray
 
-    @property
-    def representatives(self) -> np.ndarray:
-        """The vectors whose operators are kept."""
-        return np.unique(self.representative[self.representative >= 0])
-
 
 def orbits(
     vectors: np.ndarray, nodes: int, rotation: Rotation | None, n_in: int, n_out: int
