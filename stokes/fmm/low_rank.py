@@ -40,9 +40,9 @@ def tail_rank(sigma: np.ndarray, tolerance: float) -> int:
 
     sigma : (k,) singular values, falling. A zero matrix has rank 0.
     """
-    tails = np.sqrt(np.cumsum(sigma[::-1] ** 2)[::-1])
-    if len(tails) == 0 or tails[0] == 0.0:
+    if len(sigma) == 0 or sigma[0] == 0.0:
         return 0
+    tails = np.sqrt(np.cumsum((sigma[::-1] / sigma[0]) ** 2)[::-1])
     return int(np.count_nonzero(tails > tolerance * tails[0]))
 
 
@@ -64,20 +64,22 @@ def cross_approximation(
     left = np.empty((m, min(most, 32)))
     right = np.empty((min(most, 32), n))
     rank, squares, probes = 0, 0.0, 0
+    unit = 1.0  # the first pivot: what is left and right is so scaled that no square underflows
     free = np.ones(m, dtype=bool)
     pivot_row = 0
     while rank < most:
         if rank == right.shape[0]:
             left, right = _grown(left, right, min(most, 2 * rank))
-        row = rows(np.array([pivot_row]))[0] - left[pivot_row, :rank] @ right[:rank]
+        row = rows(np.array([pivot_row]))[0] / unit - left[pivot_row, :rank] @ right[:rank]
         free[pivot_row] = False
         pivot_column = int(np.argmax(np.abs(row)))
         cross = 0.0
         if row[pivot_column] != 0.0:
-            column = (
-                columns(np.array([pivot_column]))[:, 0]
-                - left[:, :rank] @ right[:rank, pivot_column]
-            )
+            if rank == 0:
+                unit = abs(row[pivot_column])
+                row = row / unit
+            column = columns(np.array([pivot_column]))[:, 0] / unit
+            column = column - left[:, :rank] @ right[:rank, pivot_column]
             row = row / row[pivot_column]
             left[:, rank], right[rank] = column, row
             cross = np.linalg.norm(column) * np.linalg.norm(row)
@@ -91,7 +93,7 @@ def cross_approximation(
         if cross <= tolerance * np.sqrt(max(squares, 0.0)):
             sample = _spread_rows(m, probes)
             probes += 1
-            residual = rows(sample) - left[sample, :rank] @ right[:rank]
+            residual = rows(sample) / unit - left[sample, :rank] @ right[:rank]
             norms = np.linalg.norm(residual, axis=1)
             mean_square = np.mean(norms**2) * m
             if mean_square <= tolerance**2 * max(squares, 0.0):
@@ -100,7 +102,7 @@ def cross_approximation(
             if not free[sample[worst]]:
                 break
             pivot_row = int(sample[worst])
-    return LowRank(left[:, :rank].copy(), right[:rank].copy())
+    return LowRank(unit * left[:, :rank], right[:rank].copy())
 
 
 def recompressed(factors: LowRank, tolerance: float) -> LowRank:
