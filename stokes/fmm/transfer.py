@@ -30,10 +30,13 @@ from stokes.fmm.kernels import Kernel
 _VECTORS = 343
 # Below the coarsest level of a standard tree with two boxes apart enough (4 boxes per edge).
 _FIRST_FAR_LEVEL = 2
-# Cost of a product in the loop over pairs against one in the loop over families.
-_PAIR_COST = 1.6
+# Cost of a product in the loop over pairs against one in the loop over families: for scalar
+# kernels the former waits for its additions, for others both wait for the cache.
+_PAIR_COST, _PAIR_COST_SCALAR = 1.3, 2.2
+# Distinct components from which on the tables of all vectors overflow the first-level cache.
+_LARGE_TABLES = 3
 # Memory for the spectra of a part of the frequencies.
-_SPECTRA_BYTES = 1 << 28
+_SPECTRA_BYTES = 1 << 26
 
 
 class Nodes(Protocol):
@@ -79,6 +82,7 @@ class FourierTransfer:
         self._lanes = kernels.VECTOR_BYTES // self.dtype.itemsize
         self._edges = np.asarray(edges, dtype=np.float64)
         self._smooth = admissibility == "smooth"
+        self._work = np.empty(0, self.dtype)
         self._frequencies = _Frequencies(self.nodes, self._lanes, self.dtype)
         self._stored = _stored_vectors(self._smooth, kernel.parity != 0)
         self._tables = {
@@ -90,8 +94,8 @@ class FourierTransfer:
 
     @property
     def bytes(self) -> int:
-        """Memory of the tables."""
-        return sum(table.nbytes for table in self._tables.values())
+        """Memory of the tables and, once used, of the spectra."""
+        return sum(table.nbytes for table in self._tables.values()) + self._work.nbytes
 
     def add(
         self,
@@ -136,11 +140,14 @@ class FourierTransfer:
             group = kernels.GROUP_THREE if self.kernel.n_out % 3 == 0 else kernels.GROUP
             at = np.asarray(cells, dtype=np.int64)
             families = _families(at[sources], at[targets], vector, group)
-        if families is not None and families.products < _PAIR_COST * len(vector):
+        scalar = self.kernel.n_in * self.kernel.n_out == 1
+        pair_cost = _PAIR_COST_SCALAR if scalar else _PAIR_COST
+        if families is not None and families.products < pair_cost * len(vector):
             none = np.empty(0, dtype=np.int64)
             return Pairs(level, sources, targets, none, none, none, none, families)
-        order = np.argsort(_CLUSTER[vector], kind="stable")
-        target, cluster = target[order], _CLUSTER[vector[order]]
+        cluster = _CLUSTER[vector] if self.kernel.n_unique >= _LARGE_TABLES else 0 * vector
+        order = np.argsort(cluster, kind="stable")
+        target, cluster = target[order], cluster[order]
         first = np.flatnonzero(np.diff(cluster * len(targets) + target, prepend=-1))
         return Pairs(
             level, sources, targets, np.append(first, len(target)), target[first],
@@ -160,8 +167,10 @@ class FourierTransfer:
         result = _Rows(pairs.targets, self.kernel.n_out, self.nodes**3, self._lanes)
         per_block = (spectra.total + result.total) * 2 * kernels.VECTOR_BYTES
         blocks = max(1, min(self._memory // per_block, self._frequencies.blocks))
-        M = _aligned(blocks * spectra.total * 2 * self._lanes, self.dtype)
-        L = _aligned(blocks * result.total * 2 * self._lanes, self.dtype)
+        M_size, L_size = (blocks * rows.total * 2 * self._lanes for rows in (spectra, result))
+        if len(self._work) < M_size + L_size:
+            self._work = _aligned(M_size + L_size, self.dtype)
+        M, L = self._work[:M_size], self._work[M_size : M_size + L_size]
         for first in range(0, self._frequencies.blocks, blocks):
             last = min(first + blocks, self._frequencies.blocks)
             some = _Part(self._frequencies, first, last, self.nodes, self._lanes, self.dtype)
