@@ -31,19 +31,34 @@ def direct_sum(
     (n, n_in, r) for r right-hand sides, or (n,) if n_in = 1. Returns (m, n_out), (m, n_out, r),
     or (m,) if weights are (n,) and n_out = 1. A singular kernel counts 0 at coincident points.
     """
-    y = _points("sources", sources)
-    x = y if targets is None else _points("targets", targets)
-    given = np.asarray(weights, np.float64)
-    w = _as_columns(kernel, given, len(y))
+    error = None
+    try:
+        x, y, w = _checked(kernel, sources, targets, weights)
+    except ValueError as wrong:
+        error = wrong
+    if parallel is not None:
+        parallel.raise_together(error)
+    elif error is not None:
+        raise error
     out = np.zeros((w.shape[2], kernel.n_out, len(x)))
     near = NearField(kernel, threads=threads)
     groups = _groups(len(x))
     for block_y, block_w in _blocks(y, w, parallel):
         _add(near, np.ascontiguousarray(x.T), groups, block_y, block_w, out)
     result = np.ascontiguousarray(out.transpose(2, 1, 0))
-    if given.ndim == 3:
+    rank = np.ndim(weights)
+    if rank == 3:
         return result
-    return result[:, 0, 0] if given.ndim == 1 and kernel.n_out == 1 else result[:, :, 0]
+    return result[:, 0, 0] if rank == 1 and kernel.n_out == 1 else result[:, :, 0]
+
+
+def _checked(
+    kernel: Kernel, sources: ArrayLike, targets: ArrayLike | None, weights: ArrayLike
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Targets (m, 3), sources (n, 3) and weights (n, n_in, r)."""
+    y = _points("sources", sources)
+    x = y if targets is None else _points("targets", targets)
+    return x, y, _as_columns(kernel, np.asarray(weights, np.float64), len(y))
 
 
 def _points(name: str, points: ArrayLike) -> NDArray:

@@ -229,7 +229,7 @@ def inverse_distance(r2: float) -> float:
     Two steps of fourth order from a guess by the exponent: multiplications only, where square
     root and division would take most of the time of a pair. r2 must be a normal number or 0.
     """
-    return 1.0 / math.sqrt(r2) if r2 > 0.0 else 0.0
+    return 0.0 if r2 == 0.0 else 1.0 / math.sqrt(r2)
 
 
 @overload(inverse_distance)
@@ -242,7 +242,7 @@ def _inverse_distance(r2):
             y += y * e * (np.float32(0.5) + e * np.float32(0.375))
             e = np.float32(1.0) - r2 * y * y
             y += y * e * np.float32(0.5)
-            return y if r2 > np.float32(0.0) else np.float32(0.0)
+            return np.float32(0.0) if r2 == np.float32(0.0) else y
 
         return single
 
@@ -252,7 +252,7 @@ def _inverse_distance(r2):
         y += y * e * (0.5 + e * (0.375 + e * 0.3125))
         e = 1.0 - r2 * y * y
         y += y * e * (0.5 + e * (0.375 + e * 0.3125))
-        return y if r2 > 0.0 else 0.0
+        return 0.0 if r2 == 0.0 else y
 
     return double
 
@@ -572,13 +572,20 @@ stokeslet_pressure = replace(
 )
 """2 r_j/r^3: pressure of the flow of `stokeslet`."""
 
+
+def _gradient_key(index: Indices) -> Indices:
+    """Of G_ij,k at (i, k, j): symmetric in i and j, in all three where they all differ."""
+    i, k, j = index
+    return _sorted(index) if len(set(index)) == 3 else (*_sorted((i, j)), k)
+
+
 stokeslet_gradient = Kernel(
     "stokeslet_gradient",
     *(_stokeslet_gradient, 3, 9),
     degree=-2.0,
     parity=-1,
     outputs=TENSOR,
-    entry=_entries(TENSOR, VECTOR, lambda index: (*_sorted((index[0], index[2])), index[1])),
+    entry=_entries(TENSOR, VECTOR, _gradient_key),
     single=True,
     base=stokeslet,
     derivative="target",

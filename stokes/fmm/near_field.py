@@ -42,7 +42,7 @@ class NearField:
         self.kernel = kernel
         self.single = single and kernel.single
         self.threads = threads
-        self._loop = _loop(
+        self.loop = _loop(
             kernel.apply,
             kernel.n_in,
             kernel.n_out,
@@ -71,7 +71,7 @@ class NearField:
         self._check(targets, sources, weights, out)
         if self.threads > 1:
             numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))
-        self._loop(
+        self.loop(
             targets,
             np.ascontiguousarray(target_range, np.int64),
             sources,
@@ -116,7 +116,11 @@ def _loop(
             first, last = target_range[g, 0], target_range[g, 1]
             if first == last:
                 continue
-            centre = _middle(targets, first, last)
+            centre = (
+                _middle(targets[0], first, last),
+                _middle(targets[1], first, last),
+                _middle(targets[2], first, last),
+            )
             tile = np.empty((rows, columns), real)
             filled = 0
             for k in range(start[g], start[g + 1]):
@@ -144,13 +148,11 @@ def _loop(
 
 
 @register_jitable
-def _middle(targets, first, last):
-    """Centre of the box around targets [first, last)."""
-    low, high = targets[:, first].copy(), targets[:, first].copy()
-    for d in range(3):
-        for i in range(first + 1, last):
-            low[d] = min(low[d], targets[d, i])
-            high[d] = max(high[d], targets[d, i])
+def _middle(values, first, last):
+    """Middle of the smallest and largest of values [first, last)."""
+    low = high = values[first]
+    for i in range(first + 1, last):
+        low, high = min(low, values[i]), max(high, values[i])
     return 0.5 * (low + high)
 
 
