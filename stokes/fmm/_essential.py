@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -101,6 +102,7 @@ class Ends:
         ranks, count, _ = self.shares((int(code).bit_length() - 1) // 3, code)
         return ranks[count[:, 0] > 0]
 
+    @cached_property
     def shared(self) -> NDArray[np.int64]:
         """Codes, rising, of all boxes that hold points of several ranks."""
         code = np.where(self.occupied[:, None, None], self.code, 0)
@@ -287,7 +289,7 @@ class GhostMultipoles:
         for rows in asked.values():
             mine[rows] = True
         self._sums, send = _numbered(
-            _other_holders(np.flatnonzero(mine & np.isin(code, ends.shared())), code, ends)
+            _other_holders(np.flatnonzero(mine & np.isin(code, ends.shared)), code, ends)
         )
         self._adding = Halo.build(parallel, len(self._sums), send)
         # Holders learn by the same way which boxes they are to bring.
@@ -355,7 +357,7 @@ def ask(
         int(r): code[foreign[owner[foreign] == r]] for r in np.unique(owner[foreign])
     }
     leaves = np.flatnonzero(sources)
-    shared = np.isin(code[leaves], ends.shared())
+    shared = np.isin(code[leaves], ends.shared)
     single = leaves[~shared & (owner[leaves] != parallel.rank)]
     wanted_sources = {int(r): code[single[owner[single] == r]] for r in np.unique(owner[single])}
     for rank, boxes in _other_holders(leaves[shared], code, ends).items():

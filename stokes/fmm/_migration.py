@@ -55,16 +55,17 @@ def find_splitters(parallel: Parallel, point_sets: list[tuple[NDArray, int]]) ->
         [-(-total * s // parallel.size) for s in range(1, parallel.size)], dtype=np.int64
     )
     key, index = np.zeros_like(quantile), np.zeros_like(quantile)
-    digits, still = np.arange(1, 1 << _DIGIT, dtype=np.int64), np.zeros(1, dtype=np.int64)
+    digits = np.arange(1, 1 << _DIGIT, dtype=np.int64)
+    still = np.zeros_like(digits)
 
     def digit(key_step: NDArray, index_step: NDArray) -> NDArray[np.int64]:
         """How many of the steps leave fewer points below than the quantile."""
-        candidates = np.broadcast_arrays(key[:, None] + key_step, index[:, None] + index_step)
-        below = np.zeros(candidates[0].size, dtype=np.int64)
+        some_keys, some_indices = key[:, None] + key_step, index[:, None] + index_step
+        below = np.zeros(some_keys.size, dtype=np.int64)
         for keys, indices in ordered:
-            below += kernels.counts_below(keys, indices, *(c.ravel() for c in candidates))
+            below += kernels.counts_below(keys, indices, some_keys.ravel(), some_indices.ravel())
         parallel.sum_in_place(below)
-        return np.count_nonzero(below.reshape(candidates[0].shape) < quantile[:, None], axis=1)
+        return np.count_nonzero(below.reshape(some_keys.shape) < quantile[:, None], axis=1)
 
     for shift in _digit_shifts(3 * morton.LEVELS):
         key += digit(digits << shift, still) << shift

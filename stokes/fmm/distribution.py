@@ -13,7 +13,7 @@ level that touch it, p(b) its parent. Let t be a target box of the rank: it hold
 region.
 
 - V: s is a child of a box that touches p(t) or is it, so that N(p(s)) holds p(t), a part of the
-  region.
+  region. With "smooth" admissibility touching leaves of one level are such pairs, too.
 - W: t is a leaf, s smaller, and p(s) touches t or lies in it, so that a box of N(p(s)) lies in t:
   N(p(s)) meets the region.
 - U: leaves t and s touch, or are one. N(s) meets t, whichever is the larger: if t is, a box of
@@ -26,7 +26,7 @@ So the rank needs s only if N(p(s)) meets its region, or if s lies in a box with
 it needs. That set holds the parent of each of its members, as N(p(s)) lies within N(p(p(s))), and
 with one child all children that have sources, so that the lists built on it are those of the
 whole tree. A rank tells the others of its region by one interval of keys that covers it; the
-owners of boxes send all that may be needed in one exchange (48 bytes a box, no points yet). From
+owners of boxes send all that may be needed in one exchange (32 bytes a box, no points yet). From
 its lists the rank then knows what it does need, asks for that, and forgets the rest.
 
 A leaf may be shared: its sources come from all of its holders, its targets stay where they are.
@@ -64,7 +64,8 @@ class DistributionReport:
     """What this rank holds.
 
     sources, targets : its own points; ghost_sources : those of others that it needs
-    boxes, ghost_boxes, shared_boxes : in its table; of others' points only; of several ranks'
+    boxes, ghost_boxes : in its table, and those among them without points of its own
+    shared_boxes     : with points of its own and of others
     ghost_multipoles : boxes whose multipoles come from others
     ghost_bytes      : memory of positions and boxes of others
     """
@@ -112,8 +113,9 @@ class Distribution:
         self.parallel = parallel
         self.admissibility = admissibility
         self.direct_below = direct_below
-        one_set = targets is None or targets is sources
-        point_sets = _checked(parallel, [sources] if one_set else [sources, targets])
+        one_set = not parallel.any(targets is not None and targets is not sources)
+        point_sets = [sources] if one_set else [sources, sources if targets is None else targets]
+        point_sets = _checked(parallel, point_sets)
         self.origin, self.edge = _root_cube(parallel, point_sets)
         routes = self._migrate(point_sets)
         (self._source_route, x_sources, source_keys) = routes[0]
@@ -159,15 +161,13 @@ class Distribution:
             np.ascontiguousarray(weights).reshape(len(weights), math.prod(shape))
         )
         columns = np.empty((rows.shape[1], self.x_sources.shape[1]), dtype=rows.dtype)
-        own = self.own_sources
-        kernels.take_transposed(rows, order, columns[:, own])
-        if self._ghost_sources is not None:
-            count = len(order)
-            values = np.empty((columns.shape[1], len(columns)), dtype=rows.dtype)
-            np.take(rows, order, axis=0, out=values[:count])
+        if self._ghost_sources is None:
+            kernels.take_transposed(rows, order, columns)
+        else:
+            values = np.empty(columns.shape[::-1], dtype=rows.dtype)
+            np.take(rows, order, axis=0, out=values[: len(order)])
             self._ghost_sources.forward(values)
-            columns[:, : own.start] = values[count : count + own.start].T
-            columns[:, own.stop :] = values[count + own.start :].T
+            self._lay_down(values, columns)
         return columns.reshape(*shape, columns.shape[1])
 
     def complete_multipoles(self, multipoles: NDArray) -> None:
@@ -209,7 +209,7 @@ class Distribution:
     ) -> int:
         """Collective. Build the local tree and fetch the essential part of the others'.
 
-        Returns the number of boxes in it with points of several ranks.
+        Returns the number of boxes that this rank shares with others.
         """
         parallel = self.parallel
         ends = essential.Ends.exchange(parallel, source_keys, target_keys)
@@ -237,7 +237,8 @@ class Distribution:
         self.upward = replace(
             self.boxes, sources=own, source_count=(own[:, 1] - own[:, 0]).astype(np.int64)
         )
-        return int(np.isin(code, ends.shared()).sum())
+        shared = np.isin(code, ends.shared) & (self.has_sources | self.has_targets)
+        return int(np.count_nonzero(shared))
 
     def _fetch_sources(
         self, boxes: Boxes, x_sources: NDArray, asked: dict[int, NDArray[np.int64]]
@@ -256,11 +257,18 @@ class Distribution:
         sender = np.full((len(values), 1), self.parallel.rank, dtype=np.int32)
         halo.forward(sender)
         below = int(np.count_nonzero(sender[count:] < self.parallel.rank))
-        self.x_sources = np.concatenate(
-            (values[count : count + below].T, values[:count].T, values[count + below :].T), axis=1
-        )
         self.own_sources = slice(below, below + count)
+        self.x_sources = np.empty((3, len(values)))
+        self._lay_down(values, self.x_sources)
         self._ghost_sources = halo
+
+    def _lay_down(self, values: NDArray, columns: NDArray) -> None:
+        """Rows (n_held, c), own before ghosts, as columns (c, n_held) in the order of the curve."""
+        below, above = self.own_sources.start, self.own_sources.stop
+        count = above - below
+        columns[:, below:above] = values[:count].T
+        columns[:, :below] = values[count:above].T
+        columns[:, above:] = values[above:].T
 
     def _report(self, shared: int) -> DistributionReport:
         held = self.x_sources.shape[1]

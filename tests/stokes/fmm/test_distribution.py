@@ -191,6 +191,7 @@ def assert_tree_of_one_rank(parallel, sources, targets, rule, spread=(evenly, ev
         assert np.all(parallel.max(held) == 1)
     assert_same_lists(distribution, whole, row, **options)
     assert_no_idle_ghosts(distribution)
+    assert distribution.x_sources.flags.c_contiguous and distribution.x_targets.flags.c_contiguous
     assert_counts_once(parallel, distribution, own_sources, 11)
     assert np.array_equal(distribution.gather(distribution.x_targets), own_targets)
     return distribution
@@ -218,7 +219,7 @@ def test_uniform_tree_is_that_of_one_rank(parallel, cloud, depth, admissibility)
 
 
 @pytest.mark.mpi(ranks=RANKS)
-@pytest.mark.parametrize("direct_below", [0, 12])
+@pytest.mark.parametrize("direct_below", [0, 12, 10**9])
 @pytest.mark.parametrize("spread", [(all_on_first, all_on_first), (all_on_first, all_on_last)])
 def test_points_may_all_come_from_one_rank(parallel, spread, direct_below):
     rng = np.random.default_rng(3)
@@ -348,24 +349,28 @@ def test_one_rank_sends_nothing(parallel):
 
 @pytest.mark.mpi(ranks=[1, 8])
 def test_ghosts_are_a_layer_about_the_points_of_a_rank(parallel):
-    """Near leaves are neighbours, far boxes a number a level: a small part of the whole.
+    """Each of 8 ranks has an octant, 8³ of 16³ leaves of 8 points, that touches others' on 3 sides.
 
-    A rank of 8 has an octant of 16³ leaves: those that touch it are (9³ - 8³) / 16³ = 5 %.
+    Ghost points are those of the 9³ - 8³ leaves that touch it. Ghost boxes are the children of
+    the parents that touch one of its boxes: 10³ - 8³ of the finest, 6³ - 4³, 4³ - 2³ and 2³ - 1
+    of the coarser levels; those of level 1 touch each other and are not far. All share the root.
     """
-    n = 40_000
-    points = cube(n, np.random.default_rng(12))
+    axis = np.arange(32.0)
+    points = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     distribution, *_ = distributed(parallel, points, points, tree.Splitting(depth=4))
     report = distribution.report
-    assert report.ghost_sources == distribution.x_sources.shape[1] - report.sources
-    assert report.shared_boxes <= 2 * distribution.boxes.levels
     if parallel.size == 1:
+        assert report.sources == report.targets == 32**3
         assert report.ghost_sources == report.ghost_boxes == report.ghost_multipoles == 0
         assert report.shared_boxes == report.ghost_bytes == 0
     else:
-        assert report.ghost_sources < 0.08 * n
-        assert report.ghost_bytes >= 24 * report.ghost_sources > 0
-        # Boxes of 2 cells about the octant on each level, 8³ (1 + 2/8)³ of the finest among them
-        assert report.ghost_boxes < 0.5 * len(whole_tree(points, points, tree.Splitting(depth=4)))
+        assert report.sources == report.targets == 16**3
+        assert report.ghost_sources == 8 * (9**3 - 8**3)
+        assert report.ghost_multipoles == 488 + 152 + 56
+        assert report.ghost_boxes == 488 + 152 + 56 + 7
+        assert report.boxes == 1 + 8 + 4**3 + 6**3 + 10**3
+        assert report.shared_boxes == 1
+        assert report.ghost_bytes > 24 * report.ghost_sources
 
 
 @pytest.mark.mpi(ranks=[1, 3])
