@@ -4,9 +4,10 @@ Letters: c component of a weight or value; i, j, k grid nodes along x, y, z; q a
 s, ds the Lagrange polynomials and their derivatives at a point; t coordinate in a box, [-1, 1].
 
 Points go in chunks of `CHUNK`, padded with weight zero to a multiple of `LANES`, so that inner
-loops run over whole vector registers. Polynomials are evaluated in double, products and moments
-are of the type of the moments (double or single). Every moment belongs to one box and is summed
-in the order of its points: the number of threads does not change a bit.
+loops run over whole vector registers; moments pass between levels `COLUMNS` side by side, for the
+same reason. Polynomials are evaluated in double, products and moments are of the type of the
+moments (double or single). Every moment belongs to one box and is summed in the order of its
+points: the number of threads does not change a bit.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from dem_mpi._jit import ThreadedKernel, prange
 LANES = 8
 CHUNK = 32
 LEAVES_PER_TASK = 16
+COLUMNS = 16
 
 
 def _fused(function: Callable, *, parallel: bool = False) -> Callable:
@@ -301,66 +303,31 @@ def l2p_gradient(x, locals_, leaves, ranges, centre, half, nodes, scale, out):
 
 
 @_fused
-def _contract(matrix, inputs, outer, inner, out):
-    """out[o, i, r] += Σ_j matrix[i, j] inputs[o, j, r] on flat arrays of outer × nodes × inner."""
-    size = len(matrix)
+def _contract(matrix, inputs, out):
+    """out[o, i, r] += Σ_j matrix[i, j] inputs[o, j, r], four inputs to a pass over r."""
+    outer, size, inner = inputs.shape
+    odd = size % 4
     for o in range(outer):
-        start = o * size * inner
         for i in range(size):
-            target = out[start + i * inner : start + (i + 1) * inner]
-            j = 0
-            while j + 3 <= size:
-                m0, m1, m2 = matrix[i, j], matrix[i, j + 1], matrix[i, j + 2]
-                at = start + j * inner
-                in0 = inputs[at : at + inner]
-                in1 = inputs[at + inner : at + 2 * inner]
-                in2 = inputs[at + 2 * inner : at + 3 * inner]
+            if odd == 1:
+                m0 = matrix[i, 0]
                 for r in range(inner):
-                    target[r] += m0 * in0[r] + (m1 * in1[r] + m2 * in2[r])
-                j += 3
-            while j < size:
-                m0 = matrix[i, j]
-                at = start + j * inner
-                in0 = inputs[at : at + inner]
+                    out[o, i, r] += m0 * inputs[o, 0, r]
+            elif odd == 2:
+                m0, m1 = matrix[i, 0], matrix[i, 1]
                 for r in range(inner):
-                    target[r] += m0 * in0[r]
-                j += 1
-
-
-@_fused
-def _gather(moments, boxes, components, block):
-    """block[n, lane] = moments[boxes[lane], components[lane], n], zero where there is no box.
-
-    Returns False, with nothing written, if no lane has a box.
-    """
-    if boxes.max() < 0:
-        return False
-    size = len(block)
-    for first in range(0, size, 8):
-        past = min(first + 8, size)
-        for lane in range(len(boxes)):
-            b = boxes[lane]
-            if b < 0:
-                for n in range(first, past):
-                    block[n, lane] = 0
-            else:
-                source = moments[b, components[lane]]
-                for n in range(first, past):
-                    block[n, lane] = source[n]
-    return True
-
-
-@_fused
-def _scatter(block, boxes, components, moments):
-    """moments[boxes[lane], components[lane], n] += block[n, lane] where there is a box."""
-    size = len(block)
-    for first in range(0, size, 8):
-        past = min(first + 8, size)
-        for lane in range(len(boxes)):
-            if boxes[lane] >= 0:
-                target = moments[boxes[lane], components[lane]]
-                for n in range(first, past):
-                    target[n] += block[n, lane]
+                    out[o, i, r] += m0 * inputs[o, 0, r] + m1 * inputs[o, 1, r]
+            elif odd == 3:
+                m0, m1, m2 = matrix[i, 0], matrix[i, 1], matrix[i, 2]
+                for r in range(inner):
+                    front = m0 * inputs[o, 0, r] + m1 * inputs[o, 1, r]
+                    out[o, i, r] += front + m2 * inputs[o, 2, r]
+            for j in range(odd, size, 4):
+                m0, m1, m2, m3 = matrix[i, j], matrix[i, j + 1], matrix[i, j + 2], matrix[i, j + 3]
+                for r in range(inner):
+                    front = m0 * inputs[o, j, r] + m1 * inputs[o, j + 1, r]
+                    back = m2 * inputs[o, j + 2, r] + m3 * inputs[o, j + 3, r]
+                    out[o, i, r] += front + back
 
 
 @_fused
@@ -379,66 +346,88 @@ def _family(parents, children, first, n_components, family, components):
 
 
 @_fused_threads
-def m2m(parents, children, matrices, lanes, moments):
+def m2m(parents, children, matrices, moments):
     """moments[parent] += Σ_children (A_x ⊗ A_y ⊗ A_z) moments[child] (B eq. 1.18).
 
     Siblings that share their halves along the remaining axes are summed as soon as one axis is
-    contracted: 8 + 4 + 2 contractions instead of 24. `lanes` columns (parent, component) lie
-    innermost, so that all loops run over whole vectors at any number of nodes.
+    contracted: 8 + 4 + 2 contractions instead of 24. Along x the rows of a box are long enough
+    for vectors; for y and z, `COLUMNS` columns (parent, component) are put side by side.
 
     parents : boxes to be added to; children : (boxes, 8) by octant (bit a: half of axis a), -1
     absent; matrices : (2, nodes, nodes) of the moments' type, [h, i, j] = S_i(node j of half h);
     moments : (boxes, components, nodes³) contiguous.
     """
     size = matrices.shape[1]
+    plane = size * size
     n_components = moments.shape[1]
-    batches = -(-len(parents) * n_components // lanes)
+    x_rows, y_rows, z_rows = (1, size, plane), (size, size, size * COLUMNS), (plane, size, COLUMNS)
+    batches = -(-len(parents) * n_components // COLUMNS)
     for batch in prange(batches):
-        family = np.empty((9, lanes), np.int64)
-        components = np.empty(lanes, np.int64)
-        blocks = np.empty((4, size * size * size, lanes), moments.dtype)
-        source, along_x, along_xy, total = blocks[0], blocks[1], blocks[2], blocks[3]
-        _family(parents, children, batch * lanes, n_components, family, components)
-        total[:] = 0
+        family = np.empty((9, COLUMNS), np.int64)
+        components = np.empty(COLUMNS, np.int64)
+        column = np.empty(plane * size, moments.dtype)
+        along_x = np.empty((plane * size, COLUMNS), moments.dtype)
+        along_xy = np.empty((plane * size, COLUMNS), moments.dtype)
+        total = np.zeros((plane * size, COLUMNS), moments.dtype)
+        _family(parents, children, batch * COLUMNS, n_components, family, components)
         for z in range(2):
             along_xy[:] = 0
             for y in range(2):
-                along_x[:] = 0
-                for x in range(2):
-                    if _gather(moments, family[x + 2 * y + 4 * z], components, source):
-                        inner = size * size * lanes
-                        _contract(matrices[x], source.ravel(), 1, inner, along_x.ravel())
-                _contract(matrices[y], along_x.ravel(), size, size * lanes, along_xy.ravel())
-            _contract(matrices[z], along_xy.ravel(), size * size, lanes, total.ravel())
-        _scatter(total, family[8], components, moments)
+                for lane in range(COLUMNS):
+                    column[:] = 0
+                    for x in range(2):
+                        child = family[x + 2 * y + 4 * z, lane]
+                        if child >= 0:
+                            source = moments[child, components[lane]]
+                            _contract(matrices[x], source.reshape(x_rows), column.reshape(x_rows))
+                    for n in range(plane * size):
+                        along_x[n, lane] = column[n]
+                _contract(matrices[y], along_x.reshape(y_rows), along_xy.reshape(y_rows))
+            _contract(matrices[z], along_xy.reshape(z_rows), total.reshape(z_rows))
+        for lane in range(COLUMNS):
+            if family[8, lane] >= 0:
+                target = moments[family[8, lane], components[lane]]
+                for n in range(plane * size):
+                    target[n] += total[n, lane]
 
 
 @_fused_threads
-def l2l(parents, children, matrices, lanes, locals_):
+def l2l(parents, children, matrices, locals_):
     """locals_[child] += (A_xᵀ ⊗ A_yᵀ ⊗ A_zᵀ) locals_[parent] (B eq. 1.20): the transpose of `m2m`.
 
     Arguments as there, but for matrices : (2, nodes, nodes), [h, j, i] = S_i(node j of half h).
     """
     size = matrices.shape[1]
+    plane = size * size
     n_components = locals_.shape[1]
-    batches = -(-len(parents) * n_components // lanes)
+    x_rows, y_rows, z_rows = (1, size, plane), (size, size, size * COLUMNS), (plane, size, COLUMNS)
+    batches = -(-len(parents) * n_components // COLUMNS)
     for batch in prange(batches):
-        family = np.empty((9, lanes), np.int64)
-        components = np.empty(lanes, np.int64)
-        blocks = np.empty((4, size * size * size, lanes), locals_.dtype)
-        source, along_z, along_yz, total = blocks[0], blocks[1], blocks[2], blocks[3]
-        _family(parents, children, batch * lanes, n_components, family, components)
-        _gather(locals_, family[8], components, source)
+        family = np.empty((9, COLUMNS), np.int64)
+        components = np.empty(COLUMNS, np.int64)
+        column = np.empty(plane * size, locals_.dtype)
+        source = np.zeros((plane * size, COLUMNS), locals_.dtype)
+        along_z = np.empty((plane * size, COLUMNS), locals_.dtype)
+        along_yz = np.empty((plane * size, COLUMNS), locals_.dtype)
+        _family(parents, children, batch * COLUMNS, n_components, family, components)
+        for lane in range(COLUMNS):
+            if family[8, lane] >= 0:
+                parent = locals_[family[8, lane], components[lane]]
+                for n in range(plane * size):
+                    source[n, lane] = parent[n]
         for z in range(2):
             along_z[:] = 0
-            _contract(matrices[z], source.ravel(), size * size, lanes, along_z.ravel())
+            _contract(matrices[z], source.reshape(z_rows), along_z.reshape(z_rows))
             for y in range(2):
                 along_yz[:] = 0
-                _contract(matrices[y], along_z.ravel(), size, size * lanes, along_yz.ravel())
-                for x in range(2):
-                    child = family[x + 2 * y + 4 * z]
-                    if child.max() >= 0:
-                        total[:] = 0
-                        inner = size * size * lanes
-                        _contract(matrices[x], along_yz.ravel(), 1, inner, total.ravel())
-                        _scatter(total, child, components, locals_)
+                _contract(matrices[y], along_z.reshape(y_rows), along_yz.reshape(y_rows))
+                for lane in range(COLUMNS):
+                    lower, upper = family[2 * y + 4 * z, lane], family[1 + 2 * y + 4 * z, lane]
+                    if lower < 0 and upper < 0:
+                        continue
+                    for n in range(plane * size):
+                        column[n] = along_yz[n, lane]
+                    for x, child in enumerate((lower, upper)):
+                        if child >= 0:
+                            target = locals_[child, components[lane]]
+                            _contract(matrices[x], column.reshape(x_rows), target.reshape(x_rows))

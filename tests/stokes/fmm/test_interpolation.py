@@ -123,6 +123,38 @@ def test_round_off_grows_on_equispaced_nodes_and_not_on_chebyshev_nodes():
     assert grown["equispaced", 30] > 1e6
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("nodes", [4, 8, 12, 16])
+def test_noise_gain_is_the_growth_of_random_errors_in_kernel_values(kind, nodes):
+    # One of three directions, targets and sources: the cube root of the gain in space.
+    grid = Grid(kind, nodes)
+    rng = np.random.default_rng(13)
+    noise = rng.normal(size=(100, nodes, nodes))
+    s_x, s_y = (grid.evaluate(rng.uniform(-1, 1, 1000)) for _ in range(2))
+    grown = np.sqrt(np.mean((s_x @ noise @ s_y.T) ** 2))
+    # sampled over 1000 points each; near the ends of equispaced nodes lies most of the sum
+    assert grown == pytest.approx(grid.noise_gain ** (1 / 3), rel=0.2)
+
+
+def test_error_of_interpolated_kernel_ends_at_the_noise_gain_times_rounding():
+    # Kernel 1/r of two boxes at distance 3, values rounded to single precision: the error falls
+    # with the nodes to a floor, which rises on equispaced nodes and stays on Chebyshev nodes.
+    rng = np.random.default_rng(14)
+    x, y = rng.uniform(-1, 1, (2, 300))
+    exact = 1 / (6 + x[:, None] - y)
+
+    def error(kind, nodes):
+        grid = Grid(kind, nodes)
+        values = (1 / (6 + grid.points[:, None] - grid.points)).astype(np.float32)
+        return np.abs(grid.evaluate(x) @ values.astype(float) @ grid.evaluate(y).T - exact).max()
+
+    unit = np.finfo(np.float32).eps / 6
+    assert error("equispaced", 8) < 1e-6
+    assert error("chebyshev", 8) < 1e-6
+    assert error("equispaced", 20) > 1e3 * unit
+    assert error("chebyshev", 20) < 4 * unit
+
+
 def test_lebesgue_constants_are_those_of_the_literature():
     # L. N. Trefethen and J. A. C. Weideman, J. Approx. Theory 65 (1991): Λ ~ 2^(n+1)/(e n ln n).
     n = 30
