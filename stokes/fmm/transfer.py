@@ -40,17 +40,18 @@ _SPECTRA_BYTES = 1 << 26
 
 
 class Nodes(Protocol):
-    """What is used of a grid: its kind and nodes per direction."""
+    """What is used of a grid: its kind, nodes per direction, and its size in that of the box."""
 
     kind: str
     nodes: int
+    extent: float
 
 
 class FourierTransfer:
     """The transfer of a kernel between the boxes of a level.
 
     kernel        homogeneous kernels have one table, others one a level
-    grid          an equispaced grid with the nodes at the corners of the box among its nodes
+    grid          an equispaced grid, of any extent about the centre of the box
     edges         (levels,) edge of a box at each level, root first
     admissibility "standard", or "smooth": boxes of the last level reach their neighbours too
     dtype         of tables, multipoles and locals
@@ -76,6 +77,7 @@ class FourierTransfer:
             raise ValueError(f"nodes = {grid.nodes}: must be >= 2")
         self.kernel = kernel
         self.nodes = grid.nodes
+        self._grid = grid
         self.dtype = np.dtype(dtype)
         self.threads = threads
         self._memory = memory
@@ -237,7 +239,7 @@ class FourierTransfer:
 
     def _build(self, edge: float) -> NDArray:
         """Spectra of the kernel for the stored vectors: [block][vector][component][re, im]."""
-        values = _windows(self.kernel, self.nodes, edge, self._stored).astype(self.dtype)
+        values = _windows(self.kernel, self._grid, edge, self._stored).astype(self.dtype)
         n = 2 * self.nodes - 1
         rows = _Rows(np.arange(len(values)), 1, n**3, self._lanes, exact=True)
         part = _Part(self._frequencies, 0, self._frequencies.blocks, n, self._lanes, self.dtype)
@@ -401,20 +403,16 @@ def _stored_vectors(smooth: bool, mirrored: bool) -> NDArray:
     return stored
 
 
-def _windows(kernel: Kernel, nodes: int, edge: float, stored: NDArray) -> NDArray:
+def _windows(kernel: Kernel, grid: Nodes, edge: float, stored: NDArray) -> NDArray:
     """Kernel at the differences of nodes for each stored vector: (vectors n_unique, n, n, n)."""
-    n, step = 2 * nodes - 1, nodes - 1
-    x = np.arange(-4 * step, 4 * step + 1) * (edge / step)
-    lattice = np.empty((kernel.n_unique, *3 * [len(x)]))
-    plane = np.stack(np.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
-    for i, first in enumerate(x):
-        r = np.concatenate([np.full((len(plane), 1), first), plane], axis=1)
-        lattice[:, i] = kernel.unique(r).T.reshape(-1, len(x), len(x))
+    difference = grid.extent * edge * np.linspace(-1.0, 1.0, 2 * grid.nodes - 1)
     vectors = np.flatnonzero(stored >= 0)
+    n = len(difference)
     values = np.empty((len(vectors), kernel.n_unique, n, n, n))
     for k, v in enumerate(vectors):
-        a, b, c = (_OFFSETS[v] + 3) * step
-        values[k] = lattice[:, a : a + n, b : b + n, c : c + n]
+        axes = np.meshgrid(*(difference + edge * _OFFSETS[v][:, None]), indexing="ij")
+        r = np.stack(axes, axis=-1).reshape(-1, 3)
+        values[k] = kernel.unique(r).T.reshape(-1, n, n, n)
     return values.reshape(-1, n, n, n)
 
 
