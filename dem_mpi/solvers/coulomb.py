@@ -26,6 +26,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,7 +38,7 @@ from dem_mpi.parallel import Parallel
 from dem_mpi.solvers.result import Solver, SolveReport
 
 if TYPE_CHECKING:
-    from dem_mpi.solvers.coulomb_newton import ProximalNewton
+    from dem_mpi.solvers.coulomb_newton import Found, ProximalNewton
 
 # Merits below this are taken for it when the tolerance of a cone problem is set.
 _LAST = 10.0
@@ -128,7 +129,7 @@ class Coulomb:
         mark, stalled = math.inf, 0
         totals = _Totals()
         best: _Iterate | None = None
-        reason = f"reached the limit of {options.max_outer} cone problems, contact.max_outer"
+        reason = f"reached the limit of {options.max_outer} cone problems (max_outer)"
         unsolved, tried = 0, math.inf
         while totals.outer < options.max_outer:
             # A guess that obeys the law already is taken as it is.
@@ -200,12 +201,13 @@ class Coulomb:
         # Not at the top: it needs PETSc, of which a solve that does not come to this needs nothing.
         from dem_mpi.solvers.coulomb_newton import ProximalNewton
 
+        started = perf_counter()
         self._newton = self._newton or ProximalNewton()
         found = self._newton.improve(problem, best.impulse, tolerance, budget)
+        totals.seconds["solve"] += perf_counter() - started
         if found is None:
             return best
-        totals.factorisations += found.factorisations
-        totals.products += found.products
+        totals.add_newton(found)
         if not found.merit < best.merit:
             return best
         return replace(
@@ -407,13 +409,17 @@ class _Iterate:
 
 @dataclass
 class _Totals:
-    """Sums over the cone problems of a solve; the first product is that of the guess."""
+    """Sums over a solve: its cone problems, and Newton's method on the law.
+
+    The first product is that of the guess.
+    """
 
     outer: int = 0
     iterations: int = 0
     products: int = 1
     factorisations: int = 0
     refinements: int = 0
+    linear_iterations: int = 0
     factor_entries: int = 0
     linear_residual: float = 0.0
     form: str = ""
@@ -427,6 +433,7 @@ class _Totals:
         self.products += report.products
         self.factorisations += report.factorisations
         self.refinements += report.refinements
+        self.linear_iterations += report.linear_iterations
         self.factor_entries = max(self.factor_entries, report.factor_entries)
         self.linear_residual = max(self.linear_residual, report.linear_residual)
         self.form = report.form or self.form
@@ -434,6 +441,16 @@ class _Totals:
         self.history.append(
             (self.iterations, residuals.dual, residuals.weighted_work, residuals.objective)
         )
+
+    def add_newton(self, found: Found) -> None:
+        """Count the linear systems of Newton's method on the law; seconds are counted elsewhere."""
+        self.products += found.products
+        self.factorisations += found.factorisations
+        self.refinements += found.refinements
+        self.factor_entries = max(self.factor_entries, found.factor_entries)
+        self.linear_residual = max(self.linear_residual, found.linear_residual)
+        if found.factorisations:
+            self.form = self.form or "contact"
 
     def report(self, best: _Iterate, reason: str, lipschitz: float) -> SolveReport:
         """Return the report of the best iterate; `reason` is why there is none that converged."""
@@ -447,6 +464,7 @@ class _Totals:
             products=self.products,
             factorisations=self.factorisations,
             refinements=self.refinements,
+            linear_iterations=self.linear_iterations,
             factor_entries=self.factor_entries,
             linear_residual=self.linear_residual,
             form=self.form,

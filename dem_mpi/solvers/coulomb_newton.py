@@ -40,14 +40,20 @@ _SOFT = 1e-6
 
 @dataclass(frozen=True)
 class Found:
-    """An impulse in its cones with its N gamma + b, and what it cost."""
+    """An impulse in its cones with its N gamma + b, and what it cost.
+
+    Counts of the linear systems are those of a `SolveReport`; their form is "contact".
+    """
 
     impulse: NDArray
     velocity: NDArray
     residuals: Residuals
     merit: float
-    factorisations: int
-    products: int
+    factorisations: int = 0
+    products: int = 0
+    refinements: int = 0
+    linear_residual: float = 0.0
+    factor_entries: int = 0
 
 
 class ProximalNewton:
@@ -96,7 +102,8 @@ class _Search:
         diagonal = problem.operator.diagonal()
         self._d = diagonal.copy()
         self._d[:, 1:] = diagonal[:, 1:].mean(axis=1, keepdims=True)
-        self._factorisations = self._products = 0
+        self._factorisations = self._products = self._refinements = 0
+        self._linear_residual = 0.0
         self._best: Found | None = None
 
     def run(self, gamma: NDArray, budget: int) -> Found:
@@ -104,7 +111,14 @@ class _Search:
         self._judge(gamma)
         with suppress(NewtonFailureError):
             self._follow(gamma, budget)
-        return replace(self._best, factorisations=self._factorisations, products=self._products)
+        return replace(
+            self._best,
+            factorisations=self._factorisations,
+            products=self._products,
+            refinements=self._refinements,
+            linear_residual=self._linear_residual,
+            factor_entries=self._system.factor_entries if self._factorisations else 0,
+        )
 
     def _follow(self, gamma: NDArray, budget: int) -> None:
         """Collective. Move the centre from `gamma` until the tolerance or the budget is met."""
@@ -161,7 +175,10 @@ class _Search:
         self._system.factor(R, R, R)
         self._factorisations += 1
         change = np.empty_like(x)
-        self._products += self._system.solve(s, change).products
+        done = self._system.solve(s, change)
+        self._products += done.products
+        self._refinements += done.refinements
+        self._linear_residual = max(self._linear_residual, done.residual)
         return change
 
     def _map(self, x: NDArray, g: NDArray) -> tuple[NDArray, tuple[NDArray, ...]]:
@@ -218,7 +235,7 @@ class _Search:
         residuals = law_residuals(self._problem, gamma, g)
         merit = self._tolerance.merit(residuals, self._problem) if residuals.finite else math.inf
         if self._best is None or merit < self._best.merit:
-            self._best = Found(gamma, g, residuals, merit, 0, 0)
+            self._best = Found(gamma, g, residuals, merit)
 
     def _solved(self) -> bool:
         return self._best is not None and self._best.merit <= 1.0

@@ -264,7 +264,9 @@ class Watching:
     def solve(self, problem, guess, lipschitz=None, tolerance=None):
         self.tolerances.append(tolerance)
         report = self.solver.solve(problem, guess, lipschitz, tolerance)
-        self.reports.append(replace(report, refinements=1, linear_residual=len(self.reports)))
+        self.reports.append(
+            replace(report, refinements=1, linear_iterations=2, linear_residual=len(self.reports))
+        )
         return self.reports[-1]
 
     def destroy(self) -> None:
@@ -279,6 +281,7 @@ def test_counts_are_sums_over_cone_problems_solved_from_coarse_to_fine():
     assert report.outer == len(inner.reports) == report.refinements > 2
     assert report.iterations == sum(r.iterations for r in inner.reports)
     assert report.products == sum(r.products for r in inner.reports) + 1
+    assert report.linear_iterations == 2 * len(inner.reports)
     assert report.linear_residual == len(inner.reports) - 1
     assert report.seconds["solve"] == pytest.approx(
         sum(r.seconds["solve"] for r in inner.reports), rel=1e-12
@@ -297,7 +300,7 @@ def test_limit_of_outer_iterations_leaves_the_best_iterate_and_says_so():
     problem = random_problem(15, 2, 1.5)
     report = solve(problem, max_outer=3)
     assert not report.converged
-    assert report.reason == "reached the limit of 3 cone problems, contact.max_outer"
+    assert report.reason == "reached the limit of 3 cone problems (max_outer)"
     assert 3 <= report.outer <= 13
     scale = problem.velocity_scale * np.array([1.0, problem.impulse_scale])
     merits = (report.history[:, 1:3] / scale).max(axis=1)
@@ -530,3 +533,22 @@ def test_newton_steps_end_at_their_budget_with_the_best_point(parallel):
     assert found.factorisations == 1
     assert 1.0 < found.merit <= wanted.merit(start, problem)
     assert np.isfinite(found.impulse).all()
+
+
+@ranks_1_2_3
+def test_newton_steps_end_a_solve_whose_cone_problems_ran_out(parallel):
+    """Two cone problems do not take the law from 1e-5 m/s to 1e-10 v_ref, Newton's method does.
+    Its linear systems are reported though the cone solver has none."""
+    problem, coarse = heap_problem(parallel)
+    law = Coulomb(cone_solver(), tight(1e-10), CoulombOptions(max_outer=2))
+    report = law.solve(problem, coarse)
+    law.destroy()
+    assert report.converged, report.reason
+    assert (report.outer, report.solver, report.form) == (2, "apgd", "contact")
+    assert report.factorisations >= 1
+    assert report.factor_entries >= 9 * parallel.sum(problem.contacts)
+    # Of direct solves in double precision: some 1e-13 at the conditions of these matrices.
+    assert 0.0 < report.linear_residual <= 1e-8
+    g = np.empty_like(report.impulse)
+    problem.operator.apply(report.impulse, g)
+    assert law_residuals(problem, report.impulse, g + problem.b) == report.residuals
