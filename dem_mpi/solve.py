@@ -293,9 +293,9 @@ def _report_lines(
     r = report.residuals
     v, gamma = cone.velocity_scale, cone.impulse_scale
     outcome = "converged" if report.converged else f"NOT CONVERGED: {report.reason}"
-    kind = {"apgd": "iterations", "scip": "Newton iterations"}.get(
-        solver, f"iterations, {report.factorisations} of them Newton's"
-    )
+    kind = "Newton iterations" if solver == "scip" else "iterations"
+    if solver == "auto" and law == "ccp":  # Coulomb's law has factorisations of its own
+        kind += f", {report.factorisations} of them Newton's"
     plural = "s" if report.outer > 1 else ""
     rounds = f" in {report.outer} cone problem{plural}" if law == "coulomb" else ""
     if report.converged and not report.iterations:
