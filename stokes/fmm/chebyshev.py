@@ -43,7 +43,7 @@ from stokes.fmm._kernels_chebyshev import (
     scatter_turned,
 )
 from stokes.fmm.kernels import Kernel
-from stokes.fmm.low_rank import LowRank, approximate, common_range
+from stokes.fmm.low_rank import LowRank, approximate, common_range, recompressed
 from stokes.fmm.symmetry import VECTORS, Orbits, orbits, transfer_vectors, vector_offset
 
 # Pairs that go through a matrix product together: enough for GEMM, few enough for the cache.
@@ -237,8 +237,9 @@ class CompressedTransfer(MatrixTransfer):
     """K_v ~ U C_v V^T with orthogonal (in the norm W) U, V common to all vectors.
 
     U and V span the ranges of all operators side by side and one below the other, each scaled to
-    norm 1, truncated where the rest is eps / sqrt(2) in the mean square. The expansions change
-    basis once a box; each pair costs one product with the small C_v. Works for every kernel.
+    norm 1, truncated where the rest is eps / sqrt(3) in the mean square. The expansions change
+    basis once a box; each pair costs products with the small C_v only, which are kept as factors
+    of low rank where that is smaller (to eps / sqrt(3) again). Works for every kernel.
     """
 
     def __init__(
@@ -263,18 +264,29 @@ class CompressedTransfer(MatrixTransfer):
     def _build(self, family: _Family) -> _Table:
         # The factors are so much more accurate than the bases that their error does not count.
         factors = dict(family.compressed(0.1 * self.eps))
-        norms = {v: np.linalg.norm(_core(f)) or 1.0 for v, f in factors.items()}
-        truncation = 0.9 * self.eps / np.sqrt(2.0)
+        norms = {v: np.linalg.norm(_range(f)) or 1.0 for v, f in factors.items()}
+        truncation = 0.9 * self.eps / np.sqrt(3.0)
         U = common_range([_range(f) / norms[v] for v, f in factors.items()], truncation)
         V = common_range([_corange(f) / norms[v] for v, f in factors.items()], truncation)
-        cores = {
-            v: _contiguous(((U.T @ f.left) @ (f.right @ V)).T, self.dtype)
-            for v, f in factors.items()
-        }
+        cores = {v: self._core(f, U, V, truncation) for v, f in factors.items()}
         to_local = _contiguous(U.T / family.weight_out, self.dtype)
         from_multipole = _contiguous(V / family.weight_in[:, None], self.dtype)
-        size = to_local.nbytes + from_multipole.nbytes + sum(c.nbytes for c in cores.values())
+        size = (
+            to_local.nbytes
+            + from_multipole.nbytes
+            + sum(c.nbytes for core in cores.values() for c in core)
+        )
         return _Table((to_local, cores, from_multipole), size)
+
+    def _core(
+        self, factors: LowRank, U: np.ndarray, V: np.ndarray, tolerance: float
+    ) -> tuple[np.ndarray, ...]:
+        """Matrices whose product, applied from the right, is C_v^T: two factors or one."""
+        core = LowRank(U.T @ factors.left, factors.right @ V)
+        low = recompressed(core, tolerance)
+        if low.rank * (len(low.left) + low.right.shape[1]) >= len(low.left) * low.right.shape[1]:
+            return (_contiguous(core.dense().T, self.dtype),)
+        return _contiguous(low.right.T, self.dtype), _contiguous(low.left.T, self.dtype)
 
     def _apply(self, table, scale, multipoles, parts, local):
         to_local, cores, from_multipole = table.data
@@ -290,7 +302,9 @@ class CompressedTransfer(MatrixTransfer):
             for v, some in part.groups:
                 sources = part.source[some]
                 gather_rows(given, sources - first, block[: len(sources)])
-                values = block[: len(sources)] @ cores[v]
+                values = block[: len(sources)]
+                for factor in cores[v]:
+                    values = values @ factor
                 scatter_rows(values, part.row[some], self.dtype.type(1), sums)
             for k in range(0, count, _PAIRS):
                 some = slice(k, k + _PAIRS)
@@ -529,11 +543,6 @@ def _root_weights(grid: Nodes) -> np.ndarray:
     w = np.sin(np.pi * (np.arange(grid.nodes) + 0.5) / grid.nodes)
     w = np.sqrt(w / w.mean())
     return np.einsum("a,b,c->abc", w, w, w).ravel()
-
-
-def _core(factors: LowRank) -> np.ndarray:
-    """A small matrix with the norm of left @ right."""
-    return _range(factors) if factors.rank else np.zeros((1, 1))
 
 
 def _range(factors: LowRank) -> np.ndarray:
