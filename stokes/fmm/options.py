@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Literal, get_args, get_type_hints
 
 Method = Literal["auto", "ufmm", "bbfmm", "symmetric"]
@@ -50,9 +50,9 @@ class FmmOptions:
         for item in fields(self):
             allowed = get_args(hints[item.name])
             value = getattr(self, item.name)
-            if all(isinstance(choice, str) for choice in allowed) and allowed:
-                if value not in allowed:
-                    raise ValueError(f"{item.name} = {value!r}: must be one of {allowed}")
+            named = bool(allowed) and all(isinstance(choice, str) for choice in allowed)
+            if named and value not in allowed:
+                raise ValueError(f"{item.name} = {value!r}: must be one of {allowed}")
         for name, least in (("order", 1), ("leaf_size", 1), ("depth", 0), ("threads", 1)):
             value = getattr(self, name)
             if value is not None and value < least:
@@ -71,33 +71,33 @@ class FmmReport:
     """What a plan is made of, on this rank unless said otherwise.
 
     method          : "ufmm", "bbfmm", "symmetric", "direct" or "fmm3d"; why: one sentence
+    expected_error  : relative 2-norm of the sum's error that the error model expects
+    compile_seconds : so far, of compiling kernels while planning and applying; a kernel that the
+                      disk cache has is not compiled
     nodes           : of a grid in one direction, order + 1
-    expected_error  : relative 2-norm that the error model expects, of the whole sum
-    leaf_size, depth: of the tree; depth is the level of the deepest leaf
-    boxes           : on this rank, those of other ranks' points included
-    pairs           : by list: point pairs of "near", node-point pairs of "multipole_to_target" and
-                      "source_to_local", box pairs of "far"
+    depth           : level of the finest leaves
+    boxes           : in this rank's table, those of other ranks' points included
+    pairs           : by list: of points ("near"), of boxes ("far"), of nodes and points
+                      ("multipole_to_target", "source_to_local")
     memory          : bytes by part
-    plan_seconds    : by phase, without compilation
-    compile_seconds : spent on compiling kernels, or on loading them from disk, while planning
+    plan_seconds    : wall clock by phase, compilation included
     """
 
     method: str
-    why: str
     kernel: str
-    nodes: int
-    precision: str
-    derivative: str
-    admissibility: str
-    near: str
     expected_error: float
-    leaf_size: int | None
-    depth: int
-    boxes: int
-    pairs: Mapping[str, int]
-    memory: Mapping[str, int]
-    plan_seconds: Mapping[str, float]
-    compile_seconds: float
+    why: str = ""
+    compile_seconds: float = 0.0
+    nodes: int = 0
+    precision: str = "double"
+    derivative: str = "exact"
+    admissibility: str = "standard"
+    leaf_size: int | None = None
+    depth: int = 0
+    boxes: int = 0
+    pairs: Mapping[str, int] = field(default_factory=dict)
+    memory: Mapping[str, int] = field(default_factory=dict)
+    plan_seconds: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ kernel's own length for others, so that neither a grid nor a table knows the siz
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -67,16 +67,19 @@ class TreeSum:
         scheme: Scheme,
         parallel: Parallel,
         threads: int = 1,
+        clock: Callable[[], float] = perf_counter,
     ) -> None:
         """Collective. Distribute the points, build tree, lists and tables.
 
         sources (n, 3), targets (m, 3), None for the sources: this rank's, in any unit, finite.
+        clock: seconds, for the stages' times.
         """
         self.kernel = kernel
         self.scheme = scheme
+        self._clock = clock
         self.plan_seconds: dict[str, float] = {}
         self.apply_seconds: dict[str, float] = {}
-        with _timed(self.plan_seconds, "tree"):
+        with self._timed(self.plan_seconds, "tree"):
             self.points = Distribution(
                 parallel,
                 sources,
@@ -86,12 +89,21 @@ class TreeSum:
                 direct_below=scheme.direct_below,
             )
             self._set_unit()
-        with _timed(self.plan_seconds, "lists"):
+        with self._timed(self.plan_seconds, "lists"):
             self.lists = self.points.lists
-        with _timed(self.plan_seconds, "tables"):
+        with self._timed(self.plan_seconds, "tables"):
             self._set_tables(threads)
-        with _timed(self.plan_seconds, "near"):
+        with self._timed(self.plan_seconds, "near"):
             self._set_near(threads)
+
+    @contextmanager
+    def _timed(self, seconds: dict[str, float], name: str) -> Iterator[None]:
+        """Add the seconds spent inside to those of the stage."""
+        start = self._clock()
+        try:
+            yield
+        finally:
+            seconds[name] = seconds.get(name, 0.0) + self._clock() - start
 
     def _set_unit(self) -> None:
         """Bring the points to internal coordinates: the root cube has its corner at the origin."""
@@ -115,7 +127,7 @@ class TreeSum:
 
     def _set_tables(self, threads: int) -> None:
         scheme = self.scheme
-        dtype = np.dtype(np.float32 if scheme.single else np.float64)
+        dtype = self._dtype = np.dtype(np.float32 if scheme.single else np.float64)
         self.grid = Grid("equispaced" if scheme.method == "ufmm" else "chebyshev", scheme.nodes)
         self._interpolator = Interpolator(self.grid, dtype, threads)
         make = {
@@ -179,6 +191,37 @@ class TreeSum:
         place = np.searchsorted(self._w_boxes, pairs.source).astype(np.int32)
         return self.boxes.targets[rows], start, _ranges(place, self.grid.nodes**3)
 
+    def pair_counts(self) -> dict[str, int]:
+        """Pairs summed by list: points, boxes, or nodes and points."""
+        boxes, lists, nodes = self.boxes, self.lists, self.grid.nodes**3
+        targets, sources = (np.diff(r, axis=1)[:, 0] for r in (boxes.targets, boxes.sources))
+        near, w, x = lists.near, lists.multipole_to_target, lists.source_to_local
+        return {
+            "near": int(np.dot(targets[near.target()].astype(np.int64), sources[near.source])),
+            "far": len(lists.far),
+            "multipole_to_target": nodes * int(np.sum(targets[w.target()], dtype=np.int64)),
+            "source_to_local": nodes * int(np.sum(sources[x.source], dtype=np.int64)),
+        }
+
+    def memory(self) -> dict[str, int]:
+        """Bytes by part."""
+        moment = self._dtype.itemsize * self.grid.nodes**3
+        return {
+            "points": self._x_sources.nbytes + self._x_targets.nbytes,
+            "boxes": _bytes_of(self.boxes),
+            "lists": sum(
+                _bytes_of(pairs)
+                for pairs in (
+                    self.lists.near,
+                    self.lists.far,
+                    self.lists.multipole_to_target,
+                    self.lists.source_to_local,
+                )
+            ),
+            "tables": int(self.transfer.bytes),
+            "expansions": moment * len(self.boxes) * (self._far.n_in + self._far.n_out),
+        }
+
     def apply(self, weights: NDArray) -> NDArray:
         """Collective. Sums (m, n_out, r) of weights (n, n_in, r), in the caller's order."""
         results = [self._apply_one(weights[:, :, c]) for c in range(weights.shape[2])]
@@ -186,28 +229,28 @@ class TreeSum:
 
     def _apply_one(self, weights: NDArray) -> NDArray:
         """One right-hand side: upward, transfers, downward, near field."""
-        clock = partial(_timed, self.apply_seconds)
-        with clock("distribute"):
+        stage = partial(self._timed, self.apply_seconds)
+        with stage("distribute"):
             w = self.points.scatter_weights(weights)
-        with clock("upward"):
+        with stage("upward"):
             multipoles = self._upward(w)
-        with clock("exchange"):
+        with stage("exchange"):
             self.points.complete_multipoles(multipoles)
         values = np.zeros((self.kernel.n_out, self._x_targets.shape[1]))
-        with clock("far"):
+        with stage("far"):
             local = self._transfers(multipoles)
-        with clock("source_to_local"):
+        with stage("source_to_local"):
             self._add_points_on_grids(w, local)
-        with clock("downward"):
+        with stage("downward"):
             self._downward(local, values)
-        with clock("multipole_to_target"):
+        with stage("multipole_to_target"):
             self._add_grids_on_points(multipoles, values)
-        with clock("near"):
+        with stage("near"):
             targets, start, sources = self._near
             self._points_on_points.add(
                 self._x_targets, targets, self._x_sources, w, start, sources, values
             )
-        with clock("distribute"):
+        with stage("distribute"):
             return self.points.gather(self._factor * values)
 
     def _upward(self, w: NDArray) -> NDArray:
@@ -276,11 +319,6 @@ def _ranges(place: NDArray, size: int) -> NDArray:
     return np.stack((place, place + 1), axis=1).astype(np.int64) * size
 
 
-@contextmanager
-def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Add the wall-clock seconds spent inside to those of the stage."""
-    start = perf_counter()
-    try:
-        yield
-    finally:
-        seconds[name] = seconds.get(name, 0.0) + perf_counter() - start
+def _bytes_of(table: Any) -> int:
+    """Bytes of the arrays of a dataclass."""
+    return sum(column.nbytes for column in vars(table).values() if isinstance(column, np.ndarray))

@@ -1,0 +1,247 @@
+"""Sums phi_i = sum_j k(x_i - y_j) w_j over n sources and m targets in O(n + m).
+
+    plan = Fmm(stokeslet, sources, targets, eps=1e-6)
+    velocity = plan.apply(forces)          # any number of times
+    plan.estimate_error(forces, velocity)  # against direct sums on sampled targets
+
+The plan fixes points, tree, lists and tables; applying it passes upward through the tree, transfers
+between boxes of one level, passes downward and adds the near field (`tree_sum`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from types import MappingProxyType
+
+import numpy as np
+from numba.core import event
+from numpy.typing import ArrayLike, NDArray
+
+from dem_mpi.parallel import Parallel
+from stokes.fmm.backends import Direct, Fmm3d
+from stokes.fmm.choice import Choice, choose
+from stokes.fmm.direct import direct_sum
+from stokes.fmm.kernels import Kernel
+from stokes.fmm.options import ErrorEstimate, FmmOptions, FmmReport
+from stokes.fmm.tree_sum import TreeSum
+
+_SAMPLE_SEED = 20170405
+
+
+class Fmm:
+    """A plan for sums of one kernel over fixed points, to a relative error eps in the 2-norm."""
+
+    def __init__(
+        self,
+        kernel: Kernel,
+        sources: ArrayLike,
+        targets: ArrayLike | None = None,
+        eps: float = 1e-6,
+        options: FmmOptions | None = None,
+        parallel: Parallel | None = None,
+    ) -> None:
+        """Collective over `parallel` (default: this process alone).
+
+        kernel  : from `stokes.fmm.kernels`, or one of your own
+        sources : (n, 3), targets (m, 3), this rank's, in any unit; None for the sources themselves.
+                  A singular kernel leaves out the term of a source that coincides with the target
+        eps     : ||u - u_direct||_2 / ||u_direct||_2 over all targets that is aimed at
+
+        Raises ValueError for points that are not finite or not (n, 3), eps outside (0, 1), and
+        options that exclude each other, on all ranks.
+        """
+        self.kernel = kernel
+        self.options = options or FmmOptions()
+        self.eps = eps
+        self._parallel = parallel or Parallel.alone()
+        self._compile_seconds = 0.0
+        error = None
+        try:
+            self._sources = _checked_points("sources", sources)
+            self._targets = None if targets is None else _checked_points("targets", targets)
+            _check_request(kernel, eps, self.options, self._parallel)
+        except ValueError as fault:
+            error = fault
+        self._parallel.raise_together(error)
+        with self._compiling():
+            self._build()
+
+    @property
+    def _points(self) -> NDArray:
+        """The targets (m, 3)."""
+        return self._sources if self._targets is None else self._targets
+
+    def _build(self) -> None:
+        threads = self.options.threads
+        self._choice: Choice | None = None
+        if self.options.backend == "direct":
+            self._sum = Direct(self.kernel, self._sources, self._points, self._parallel, threads)
+        elif self.options.backend == "fmm3d":
+            self._sum = Fmm3d(self.kernel, self._sources, self._targets, self.eps)
+        else:
+            self._choice = choose(
+                self.kernel, self._sources, self._points, self.eps, self.options, self._parallel
+            )
+            self._sum = TreeSum(
+                self.kernel,
+                self._sources,
+                self._targets,
+                self._choice.scheme,
+                self._parallel,
+                threads,
+            )
+
+    def apply(self, weights: ArrayLike) -> NDArray:
+        """Collective. The sums at this rank's targets.
+
+        weights: (n, n_in), (n, n_in, r) for r right-hand sides, or (n,) if n_in = 1. Returns
+        (m, n_out), (m, n_out, r), or (m,) if weights are (n,) and n_out = 1.
+
+        Raises ValueError, on all ranks, for weights of another shape.
+        """
+        given = np.asarray(weights, dtype=np.float64)
+        error = None
+        try:
+            columns = self._columns(given)
+        except ValueError as fault:
+            error = fault
+        self._parallel.raise_together(error)
+        with self._compiling():
+            values = self._sum.apply(columns)
+        if given.ndim == 3:
+            return values
+        return values[:, 0, 0] if given.ndim == 1 and self.kernel.n_out == 1 else values[:, :, 0]
+
+    def _columns(self, weights: NDArray) -> NDArray:
+        """Weights as (n, n_in, r)."""
+        n, n_in = len(self._sources), self.kernel.n_in
+        if weights.ndim == 1 and n_in == 1 and len(weights) == n:
+            return weights[:, None, None]
+        if weights.ndim in (2, 3) and weights.shape[:2] == (n, n_in):
+            return weights if weights.ndim == 3 else weights[:, :, None]
+        raise ValueError(
+            f"weights of shape {weights.shape}: kernel {self.kernel.name} over {n} sources "
+            f"takes ({n}, {n_in}) or ({n}, {n_in}, r)"
+        )
+
+    def estimate_error(
+        self, weights: ArrayLike, values: ArrayLike, samples: int = 1000, seed: int = _SAMPLE_SEED
+    ) -> ErrorEstimate:
+        """Collective. Compare `values = apply(weights)` with direct sums on sampled targets.
+
+        Targets are drawn without repetition, in proportion to what each rank has; of all of them
+        the estimate is the error itself. O(samples n).
+        """
+        columns = self._columns(np.asarray(weights, dtype=np.float64))
+        given = np.asarray(values, dtype=np.float64).reshape(
+            len(self._points), self.kernel.n_out, columns.shape[2]
+        )
+        mine = self._sampled(samples, seed)
+        exact = direct_sum(
+            self.kernel,
+            self._sources,
+            self._points[mine],
+            columns,
+            parallel=self._parallel,
+            threads=self.options.threads,
+        )
+        difference = given[mine] - exact
+        # scaled by the largest value: squares of extreme magnitudes would leave the range
+        largest = self._parallel.max(float(np.abs(exact).max(initial=0.0)))
+        worst = self._parallel.max(float(np.abs(difference).max(initial=0.0)))
+        scale = largest or 1.0
+        squares = [np.sum((a / scale) ** 2) for a in (difference, exact)]
+        squares = self._parallel.sum(np.array(squares))
+        return ErrorEstimate(
+            relative_l2=_ratio(float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))),
+            relative_max=_ratio(worst, largest),
+            samples=self._parallel.sum(len(mine)),
+        )
+
+    def _sampled(self, samples: int, seed: int) -> NDArray[np.int64]:
+        """Targets of this rank that are in the sample."""
+        own = len(self._points)
+        total, before = self._parallel.sum(own), self._parallel.exclusive_sum(own)
+        drawn = np.random.default_rng(seed).permutation(total)[: min(samples, total)]
+        return np.sort(drawn[(drawn >= before) & (drawn < before + own)]) - before
+
+    @property
+    def apply_seconds(self) -> Mapping[str, float]:
+        """Wall-clock seconds by stage, over all applications so far, compilation included."""
+        return MappingProxyType(getattr(self._sum, "apply_seconds", {}))
+
+    @property
+    def report(self) -> FmmReport:
+        """What the plan is made of, on this rank."""
+        common = {"kernel": self.kernel.name, "compile_seconds": self._compile_seconds}
+        if self._choice is None:
+            return FmmReport(method=self.options.backend, expected_error=self.eps, **common)
+        scheme, plan = self._choice.scheme, self._sum
+        return FmmReport(
+            method=scheme.method,
+            expected_error=self._choice.expected_error,
+            why=self._choice.why,
+            nodes=scheme.nodes,
+            precision="single" if scheme.single else "double",
+            derivative=scheme.derivative,
+            admissibility=scheme.admissibility,
+            leaf_size=scheme.splitting.leaf_size,
+            depth=plan.boxes.depth,
+            boxes=len(plan.boxes),
+            pairs=plan.pair_counts(),
+            memory=plan.memory(),
+            plan_seconds=dict(plan.plan_seconds),
+            **common,
+        )
+
+    @contextmanager
+    def _compiling(self) -> Iterator[None]:
+        """Count the seconds that kernels are compiled for."""
+        with event.install_recorder("numba:compile") as record:
+            try:
+                yield
+            finally:
+                self._compile_seconds += _outermost_seconds(record.buffer)
+
+
+def _outermost_seconds(buffer: list) -> float:
+    """Seconds between start and end of events, those inside another one left out."""
+    seconds, depth, begin = 0.0, 0, 0.0
+    for moment, what in buffer:
+        if what.is_start:
+            begin = moment if depth == 0 else begin
+            depth += 1
+        else:
+            depth -= 1
+            seconds += moment - begin if depth == 0 else 0.0
+    return seconds
+
+
+def _ratio(part: float, whole: float) -> float:
+    """part / whole; 0 if both vanish."""
+    if whole > 0.0:
+        return part / whole
+    return 0.0 if part == 0.0 else np.inf
+
+
+def _checked_points(name: str, points: ArrayLike) -> NDArray[np.float64]:
+    array = np.ascontiguousarray(points, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"{name} of shape {array.shape}: must be (n, 3)")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: coordinates must be finite")
+    return array
+
+
+def _check_request(kernel: Kernel, eps: float, options: FmmOptions, parallel: Parallel) -> None:
+    if not 0.0 < eps < 1.0:
+        raise ValueError(f"eps = {eps}: must be between 0 and 1")
+    if options.derivative == "interpolated" and kernel.base is None:
+        raise ValueError(f"kernel {kernel.name} is not a derivative: derivative must be 'exact'")
+    if options.admissibility == "smooth" and not kernel.smooth:
+        raise ValueError(f"kernel {kernel.name} is not smooth at the origin: it has a near field")
+    if options.precision == "single" and not kernel.single:
+        raise ValueError(f"kernel {kernel.name} has no form in single precision")
+    if options.backend == "fmm3d" and parallel.size > 1:
+        raise ValueError("backend 'fmm3d' works on one rank only")
