@@ -680,40 +680,57 @@ def translate_pairs(
                     i += 1
 
 
+@intrinsic
+def _difference(
+    typingctx: Any, x: Any, rows: Any, first: Any, y: Any, y0: Any, stride: Any, count: Any
+) -> Any:
+    """Tables of the 27 products of one direction from those of 27 vectors.
+
+    x[rows[first + e]] is the table of vector e = (ex, ey, ez), ex slowest; that of product w goes
+    to y[y0 + w stride]. Along one axis (b, a, c) becomes (a, c - a, b - a).
+    """
+    n = types.intp
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        v = _Vectors(context, builder, x)
+        x_data, row_data, y_data = (
+            _data(context, builder, signature.args[i], args[i]) for i in (0, 1, 3)
+        )
+        sources = [_integer(builder, row_data, args[2], e) for e in range(27)]
+        with cgutils.for_range(builder, args[6], intp=args[6].type) as loop:
+            shift = builder.mul(loop.index, ir.Constant(args[6].type, v.lanes))
+            t = [v.load(x_data, builder.add(source, shift)) for source in sources]
+            for axis in (9, 3, 1):
+                for e in (e for e in range(27) if e // axis % 3 == 0):
+                    b, a, c = t[e], t[e + axis], t[e + 2 * axis]
+                    t[e], t[e + axis], t[e + 2 * axis] = a, v.subtract(c, a), v.subtract(b, a)
+            place = builder.add(args[4], shift)
+            for table in t:
+                v.store(table, y_data, place)
+                place = builder.add(place, args[5])
+        return context.get_dummy_value()
+
+    return types.void(x, rows, n, y, n, n, n), generate
+
+
 @jit
-def _differences(full, size, directions, part, products):
+def _differences(full, size, lanes, rows, products):
     """Tables of the 27 products for each direction of parents, from those of the 343 vectors.
 
     Along one axis, with a, b, c for boxes at the distances 2 D, 2 D - 1 and 2 D + 1:
     y_0 = a x_0 + b x_1 and y_1 = c x_0 + a x_1 are P_0 + P_2 and P_0 + P_1 of
     P_0 = a (x_0 + x_1), P_1 = (c - a) x_0, P_2 = (b - a) x_1.
+
+    rows : (27 directions,) offset in `full` of the vectors of each direction
     """
-    count = directions.shape[0]
-    for k in range(count):
-        for e in range(27):
-            x = 2 * directions[k, 0] + e // 9 + 2
-            y = 2 * directions[k, 1] + e // 3 % 3 + 2
-            z = 2 * directions[k, 2] + e % 3 + 2
-            at = ((x * 7 + y) * 7 + z) * size
-            part[e * size : (e + 1) * size] = full[at : at + size]
-        for stride in (9, 3, 1):
-            for e in range(27):
-                if e // stride % 3 == 0:
-                    b, a, c = e * size, (e + stride) * size, (e + 2 * stride) * size
-                    for i in range(size):
-                        centre = part[a + i]
-                        before, after = part[b + i], part[c + i]
-                        part[b + i] = centre
-                        part[a + i] = after - centre
-                        part[c + i] = before - centre
-        for w in range(27):
-            at = (w * count + k) * size
-            products[at : at + size] = part[w * size : (w + 1) * size]
+    directions = len(rows) // 27
+    for k in range(directions):
+        _difference(full, rows, 27 * k, products, k * size, directions * size, size // lanes)
 
 
 @jit_threads
 def translate_families(
-    tables, table_stride, table_size, lanes, stored, parity, directions, scratch, n_blocks,
+    tables, table_stride, table_size, lanes, stored, parity, rows, scratch, n_blocks,
     spectra, spectra_stride, source_children, steps, start, group, entry, n_in, n_out, local,
     local_stride, target_children, order, places,
 ):  # fmt: skip
@@ -723,8 +740,9 @@ def translate_families(
     takes three products of sums of children instead of four (Karatsuba's trick, transposed).
     Pairs too close to interact have zero tables, which keeps the structure.
 
-    directions : (k, 3) differences of parents; steps : flat rows of (offset of the direction in
-    the tables of a product, offsets of `group` source parents); start : (groups + 1,)
+    rows : (27 k,) offsets of the vectors in the expanded tables for k directions of parents
+    steps : flat rows of (offset of the direction in the tables of a product, offsets of `group`
+        source parents); start : (groups + 1,)
     source_children : (8 parents,) offset in a block of the spectra, of zeros where there is none
     target_children : likewise in local, parents of a group one after another
     order : (2, 9, 8) octants of sources, of targets, for the products (wx, wy), lower z first
@@ -733,21 +751,20 @@ def translate_families(
     groups, parents = len(start) - 1, len(source_children) // 8
     out_size, in_size = n_out * 2 * lanes, n_in * 2 * lanes
     in_stride, out_stride = (parents + 1) * in_size, group * out_size
-    product_size = directions.shape[0] * table_size
+    product_size = len(rows) // 27 * table_size
     octants = order.reshape(-1)
     for worker in prange(workers):
         work = scratch[worker]
         full = work[places[0] : places[1]]
-        part = work[places[1] : places[2]]
-        products = work[places[2] : places[3]]
-        sources = work[places[3] : places[4]]
-        sums = work[places[4] : places[5]]
+        products = work[places[1] : places[2]]
+        sources = work[places[2] : places[3]]
+        sums = work[places[3] : places[4]]
         for k in range(3):
             sources[(k + 1) * in_stride - in_size : (k + 1) * in_stride] = 0.0
         for block in range(n_blocks * worker // workers, n_blocks * (worker + 1) // workers):
             m0, l_first = block * spectra_stride, block * local_stride
             _expand(tables, block * table_stride, table_size, lanes, stored, parity, full)
-            _differences(full, table_size, directions, part, products)
+            _differences(full, table_size, lanes, rows, products)
             local[l_first : l_first + local_stride] = 0.0
             for w in range(9):
                 children = (2 - min(w // 3, 1)) * (2 - min(w % 3, 1))

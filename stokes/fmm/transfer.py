@@ -133,28 +133,44 @@ class FourierTransfer:
         start = np.asarray(start, dtype=np.int64)
         busy = np.flatnonzero(np.diff(start) > 0)
         targets = np.asarray(targets)[busy]
-        sources, place = np.unique(np.asarray(source[start[0] : start[-1]]), return_inverse=True)
-        vector = np.asarray(vector[start[0] : start[-1]], dtype=np.int64)
-        bounds = np.append(start[busy], start[-1]) - start[0]
-        target = np.repeat(np.arange(len(targets)), np.diff(bounds))
+        if len(targets) == 0:
+            none = np.empty(0, dtype=np.int64)
+            return Pairs(level, none, targets, none, none, none, none, None)
+        source, vector = (np.asarray(a[start[0] : start[-1]]) for a in (source, vector))
+        rank = np.zeros(source.max() + 1, dtype=np.int64)
+        rank[source] = 1
+        sources = np.flatnonzero(rank)
         families = None
-        if cells is not None and len(targets) > 0:
-            group = kernels.GROUP_THREE if self.kernel.n_out % 3 == 0 else kernels.GROUP
-            at = np.asarray(cells, dtype=np.int64)
-            families = _families(at[sources], at[targets], vector, group)
-        scalar = self.kernel.n_in * self.kernel.n_out == 1
-        pair_cost = _PAIR_COST_SCALAR if scalar else _PAIR_COST
-        if families is not None and families.products < pair_cost * len(vector):
+        if cells is not None:
+            families = self._families(np.asarray(cells), sources, targets, vector)
+        if families is not None:
             none = np.empty(0, dtype=np.int64)
             return Pairs(level, sources, targets, none, none, none, none, families)
-        cluster = _CLUSTER[vector] if self.kernel.n_unique >= _LARGE_TABLES else 0 * vector
-        order = np.argsort(cluster, kind="stable")
-        target, cluster = target[order], cluster[order]
-        first = np.flatnonzero(np.diff(cluster * len(targets) + target, prepend=-1))
-        return Pairs(
-            level, sources, targets, np.append(first, len(target)), target[first],
-            place.reshape(-1)[order], vector[order], None,
-        )  # fmt: skip
+        rank[sources] = np.arange(len(sources))
+        bounds = np.append(start[busy], start[-1]) - start[0]
+        target = np.repeat(np.arange(len(targets)), np.diff(bounds))
+        first, order = bounds, slice(None)
+        vector = vector.astype(np.int64)
+        if self.kernel.n_unique >= _LARGE_TABLES:
+            cluster = _CLUSTER[vector]
+            order = np.argsort(cluster, kind="stable")
+            run = cluster[order].astype(np.int64) * len(targets) + target[order]
+            first = np.append(np.flatnonzero(np.diff(run, prepend=-1)), len(run))
+        place, vector, target = rank[source[order]], vector[order], target[order][first[:-1]]
+        return Pairs(level, sources, targets, first, target, place, vector, None)
+
+    def _families(
+        self, cells: NDArray, sources: NDArray, targets: NDArray, vector: NDArray
+    ) -> _Families | None:
+        """Return the pairs by families of siblings if that is possible and cheaper."""
+        group = kernels.GROUP_THREE if self.kernel.n_out % 3 == 0 else kernels.GROUP
+        cells_of = (cells[boxes].astype(np.int64) for boxes in (sources, targets))
+        families = _families(*cells_of, vector, group)
+        scalar = self.kernel.n_in * self.kernel.n_out == 1
+        pair_cost = _PAIR_COST_SCALAR if scalar else _PAIR_COST
+        if families is None or families.products >= pair_cost * len(vector):
+            return None
+        return families
 
     def apply(self, pairs: Pairs, multipoles: NDArray, local: NDArray) -> None:
         """Add to the locals what the prepared pairs of a level give: see `add`."""
@@ -209,13 +225,14 @@ class FourierTransfer:
         parents = len(families.source_children)
         sizes = [
             _VECTORS * size,
-            27 * size,
             27 * len(families.directions) * size,
             3 * (parents + 1) * in_size,
             3 * group * out_size,
         ]
         places = np.concatenate([[0], np.cumsum(sizes)])
         work = _aligned_rows(max(1, min(self.threads, blocks)), places[-1], self.dtype)
+        vectors = 2 * families.directions[:, None] + _BLOCK + 3
+        rows = (vectors @ np.array([49, 7, 1])) * size
         steps = families.steps * np.array([size] + group * [in_size])
         stored = self._stored if families.neighbours else np.where(_NEAR, -1000, self._stored)
         # Offsets of the children in a block; missing ones are the box of zeros.
@@ -223,7 +240,7 @@ class FourierTransfer:
         from_ = _offsets(families.source_children, in_size, spectra.none * 2 * lanes)
         to = _offsets(families.target_children, out_size, result.none * 2 * lanes)
         kernels.translate_families.using(self.threads)(
-            *common[:4], stored, common[5], families.directions, work, blocks, M, M_stride, from_,
+            *common[:4], stored, common[5], rows.reshape(-1), work, blocks, M, M_stride, from_,
             steps.reshape(-1), families.start, group, self._entry, kernel.n_in, kernel.n_out, L,
             L_stride, to, _ORDER, places,
         )  # fmt: skip
@@ -289,9 +306,10 @@ class _Families:
 
 
 _OFFSETS = np.stack(np.meshgrid(*3 * [np.arange(-3, 4)], indexing="ij"), -1).reshape(-1, 3)
+_BLOCK = np.stack(np.meshgrid(*3 * [np.arange(-1, 2)], indexing="ij"), -1).reshape(-1, 3)
 _NEAR = np.abs(_OFFSETS).max(axis=1) <= 1
 # Which of the 27 regions before, about and behind the target in each direction a source is in.
-_CLUSTER = (np.sign(_OFFSETS) * (np.abs(_OFFSETS) > 1) + 1) @ np.array([9, 3, 1])
+_CLUSTER = ((np.sign(_OFFSETS) * (np.abs(_OFFSETS) > 1) + 1) @ np.array([9, 3, 1])).astype(np.int8)
 
 
 def _octants(first: int, second: int) -> list[list[int]]:
@@ -311,8 +329,7 @@ _ORDER = np.array([_octants(1, 2), _octants(2, 1)])
 def _families(sources: NDArray, targets: NDArray, vector: NDArray, group: int) -> _Families | None:
     """Group pairs by parents; None if they are not all there are between their families."""
     neighbours = bool(_NEAR[vector].any())
-    offsets = np.stack(np.meshgrid(*3 * [np.arange(-1, 2)], indexing="ij"), -1).reshape(-1, 3)
-    directions = offsets if neighbours else offsets[np.any(offsets != 0, axis=1)]
+    directions = _BLOCK if neighbours else _BLOCK[np.any(_BLOCK != 0, axis=1)]
     lowest = np.minimum(sources.min(axis=0), targets.min(axis=0)) >> 1
     source_parent, source_children = _parents(sources, lowest)
     target_parent, target_children = _parents(targets, lowest)
