@@ -99,7 +99,5 @@ def _add(
 ) -> None:
     start = np.arange(len(groups) + 1, dtype=np.int64)
     everything = np.tile(np.array([[0, len(y)]], dtype=np.int64), (len(groups), 1))
-    sources = np.ascontiguousarray(y.T)
-    for k in range(w.shape[2]):
-        column = np.ascontiguousarray(w[:, :, k].T)
-        near.add(x, groups, sources, column, start, everything, out[k])
+    weights = np.ascontiguousarray(w.transpose(2, 1, 0))
+    near.add(x, groups, np.ascontiguousarray(y.T), weights, start, everything, out)

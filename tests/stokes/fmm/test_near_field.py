@@ -221,6 +221,20 @@ def test_transposed_sums():
         assert abs(np.sum(u * forward) - np.sum(backward * v)) < ROUNDING * scale, kernel.name
 
 
+@pytest.mark.parametrize("count", [1, 2, 4, 6, 9])
+@pytest.mark.parametrize("single", [False, True])
+def test_several_right_hand_sides_are_sums_of_each(count, single):
+    scene = Scene(11, LARGE)
+    w = scene.rng.standard_normal((count, 3, LARGE))
+    out = np.ones((count, 3, scene.x.shape[1]))
+    scene.add(stokeslet, w, out=out, single=single)
+    _, magnitude = scene.reference(stokeslet, np.abs(w).max(axis=0))
+    tolerance = 4 * np.finfo(np.float32).eps if single else ROUNDING
+    for k in range(count):
+        alone = 1 + scene.add(stokeslet, w[k], single=single)
+        assert np.all(np.abs(out[k] - alone) <= tolerance * (1 + magnitude))
+
+
 def test_kernel_of_ones_own_with_two_outputs():
     kernel = Kernel("own", _own, 1, 2, outputs=((), ()))
     scene = Scene(10)
