@@ -19,7 +19,10 @@ CompressedTransfer. The norm weighs the nodes with the quadrature weights of the
 (W. Fong and E. Darve, J. Comput. Phys. 228, 2009; on equispaced grids all weights are 1), so that
 it stands for the root mean square of the kernel's error over all pairs of points in the two boxes.
 Interpolation itself errs independently of `eps`; the far field of points filling their boxes errs
-by about eps in the relative 2-norm, and the whole sum by less, the near field being exact.
+by about eps in the relative 2-norm. Where weights cancel the sum is small, and errs by more of it.
+Which to take: common bases with compressed cores (M. Messner et al., arXiv:1210.7292) need a half
+to a third of the time a pair of the symmetric operators, but five to eight times their memory, and
+more time to build, which counts for kernels that are not homogeneous and for large tensors.
 
 Symbols: N = nodes^3, v transfer vector (symmetry.vector_index), a, b nodes, i, j components.
 """
@@ -267,7 +270,9 @@ class CompressedTransfer(MatrixTransfer):
         norms = {v: np.linalg.norm(_range(f)) or 1.0 for v, f in factors.items()}
         truncation = 0.9 * self.eps / np.sqrt(3.0)
         U = common_range([_range(f) / norms[v] for v, f in factors.items()], truncation)
-        V = common_range([_corange(f) / norms[v] for v, f in factors.items()], truncation)
+        V = U
+        if not _is_reciprocal(self.kernel):
+            V = common_range([_corange(f) / norms[v] for v, f in factors.items()], truncation)
         cores = {v: self._core(f, U, V, truncation) for v, f in factors.items()}
         to_local = _contiguous(U.T / family.weight_out, self.dtype)
         from_multipole = _contiguous(V / family.weight_in[:, None], self.dtype)
@@ -394,6 +399,15 @@ def is_symmetric(kernel: Kernel) -> bool:
         if error > 1e-9 * np.abs(value).max():
             return False
     return True
+
+
+def _is_reciprocal(kernel: Kernel) -> bool:
+    """Whether k(-r) = +-k(r)^T, so that the transposed operators are those of -v."""
+    if kernel.n_in != kernel.n_out:
+        return False
+    r = kernel.length * np.random.default_rng(2).uniform(-2.0, 2.0, (16, 3))
+    value, mirrored = kernel.matrix(r), kernel.matrix(-r).transpose(0, 2, 1)
+    return np.array_equal(value, mirrored) or np.array_equal(value, -mirrored)
 
 
 @dataclass(frozen=True)
