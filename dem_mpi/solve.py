@@ -317,9 +317,10 @@ def _report_lines(
     lines.append(f"  objective        {r.objective:.12e} J")
     if report.factorisations:
         entries = f" of {report.factor_entries} entries" if report.factor_entries else ""
+        several = "s" if report.factorisations > 1 else ""
         lines.append(
             f"  linear systems   {report.form} form, {report.factorisations} "
-            f"factorisations{entries}, residual <= {report.linear_residual:.1e} after "
+            f"factorisation{several}{entries}, residual <= {report.linear_residual:.1e} after "
             f"{report.refinements} refinements"
         )
         if report.linear_iterations:
