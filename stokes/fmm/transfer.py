@@ -8,8 +8,8 @@ Fourier transforms make diagonal (P. Blanchard, PhD thesis, Université de Borde
 
 Three things make it fast. The lengths are small, so that products with small real matrices of
 cosines and sines, which skip padding and what is thrown away, take the place of fast transforms.
-Half of the spectrum is kept, exactly (l-1) (4 l^2 - 2 l + 1) + l ... of (2 l - 1)^3 numbers, and it
-is worked through in blocks of one vector register, whose tables stay in the cache. And where most
+Of the spectrum ((2 l - 1)^3 + 1) / 2 frequencies say all, and they
+are worked through in blocks of one vector register, whose tables stay in the cache. And where most
 boxes have all their siblings, 27 products stand for the 64 between two families of children.
 
 K_-v = parity conj(K_v) halves the tables of even and odd kernels.
@@ -17,7 +17,7 @@ K_-v = parity conj(K_v) halves the tables of even and odd kernels.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -36,7 +36,9 @@ _PAIR_COST, _PAIR_COST_SCALAR = 1.3, 2.2
 # Distinct components from which on the tables of all vectors overflow the first-level cache.
 _LARGE_TABLES = 3
 # Memory for the spectra of a part of the frequencies.
-_SPECTRA_BYTES = 1 << 26
+_SPECTRA_BYTES = 1 << 28
+# Nodes from which on each kz fills whole blocks, so that no turn computes one in part.
+_WHOLE_TURNS = 8
 
 
 class Nodes(Protocol):
@@ -189,8 +191,7 @@ class FourierTransfer:
         if len(self._work) < M_size + L_size:
             self._work = _aligned(M_size + L_size, self.dtype)
         M, L = self._work[:M_size], self._work[M_size : M_size + L_size]
-        for first in range(0, self._frequencies.blocks, blocks):
-            last = min(first + blocks, self._frequencies.blocks)
+        for first, last in self._frequencies.turns(blocks):
             some = _Part(self._frequencies, first, last, self.nodes, self._lanes, self.dtype)
             some.forward(multipoles, spectra, M, self.threads)
             self._translate(pairs, table, first, last, M, spectra, L, result)
@@ -436,6 +437,8 @@ def _windows(kernel: Kernel, grid: Nodes, edge: float, stored: NDArray) -> NDArr
 class _Frequencies:
     """The half of the frequencies of a real grid that says all, kz by kz, in whole blocks.
 
+    With many nodes each kz begins a block.
+
     Frequencies are (kx, ky, kz) with |kx|, |ky| < l and 0 <= kz < l; of kz = 0 those with kx > 0,
     or kx = 0 and ky >= 0.
     """
@@ -448,14 +451,29 @@ class _Frequencies:
             kept = (kz > 0) | (kx > 0) | ((kx == 0) & (ky >= 0))
             number[kept, kz] = count + np.arange(kept.sum())
             zero = (kx[kept] == 0) & (ky[kept] == 0) & (kz == 0)
-            weight.append(np.where(zero, 1.0, 2.0))
-            count += int(kept.sum())
+            spare = -int(kept.sum()) % lanes if nodes >= _WHOLE_TURNS else 0
+            weight.append(np.pad(np.where(zero, 1.0, 2.0), (0, spare)))
+            count += len(weight[-1])
         self.number = number
         self.blocks = -(-count // lanes)
         padded = np.zeros(self.blocks * lanes)
         padded[:count] = np.concatenate(weight) / (2 * nodes - 1) ** 3
         self.weight = padded.astype(dtype)
+        self._lanes = lanes
+        self.first = np.where(number < 0, count, number).min(axis=(0, 1))
         self.last = number.max(axis=(0, 1))
+
+    def turns(self, blocks: int) -> Iterator[tuple[int, int]]:
+        """Ranges (first, last) of at most so many blocks, ending with a kz where they can."""
+        ends = -(-(self.last + 1) // self._lanes)
+        first = 0
+        while first < self.blocks:
+            last = min(first + blocks, self.blocks)
+            whole = ends[(ends > first) & (ends <= last)]
+            if len(whole):
+                last = int(whole[-1])
+            yield first, last
+            first = last
 
 
 class _Part:
@@ -469,7 +487,7 @@ class _Part:
         self._size, self._lanes, self._blocks, self._dtype = size, lanes, last - first, dtype
         low, high = first * lanes, last * lanes
         k0 = int(np.searchsorted(frequencies.last, low))
-        k1 = min(int(np.searchsorted(frequencies.last, high - 1)) + 1, nodes)
+        k1 = int(np.searchsorted(frequencies.first, high))
         # Grids of n are the kernel's: differences of nodes about zero.
         x = np.arange(size) - (nodes - 1 if size == n else 0)
         angle = 2.0 * np.pi / n * np.outer(np.arange(nodes), x)
