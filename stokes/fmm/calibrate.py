@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from time import process_time
@@ -38,6 +39,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", choices=("errors", "costs"))
     parser.add_argument("--kernels", nargs="+", default=None, help="errors of these kernels only")
+    parser.add_argument("--grids", nargs="+", choices=tuple(_NODES), default=tuple(_NODES))
     parser.add_argument(
         "--file", type=Path, default=Path(__file__).with_name("constants.json"), metavar="FILE"
     )
@@ -49,7 +51,8 @@ def main() -> None:
         if arguments.kernels:
             wanted = [KERNELS[name] for name in arguments.kernels]
         for kernel in wanted:
-            constants["errors"][kernel.name] = errors_of(kernel)
+            rows = constants["errors"].setdefault(kernel.name, {})
+            rows.update(errors_of(kernel, arguments.grids))
             if kernel.single:
                 constants["single"][kernel.name] = round_off_of(kernel)
             _write(path, constants)
@@ -65,15 +68,15 @@ def _write(path: Path, constants: dict[str, Any]) -> None:
     path.write_text(json.dumps(constants, indent=1, sort_keys=True) + "\n")
 
 
-def errors_of(kernel: Kernel) -> dict[str, dict[str, float]]:
+def errors_of(kernel: Kernel, grids: Sequence[str]) -> dict[str, dict[str, float]]:
     """Rows of errors by nodes, the largest over distributions and signs of weights."""
     rows = {}
     edges = [None] if kernel.homogeneous else SAMPLE_EDGES
     derivatives = ("exact",) if kernel.base is None else ("exact", "interpolated")
-    for (grid, counts), derivative, edge in product(_NODES.items(), derivatives, edges):
+    for grid, derivative, edge in product(grids, derivatives, edges):
         row: dict[str, float] = {}
         method = _METHODS[grid]
-        for nodes in counts:
+        for nodes in _NODES[grid]:
             scheme = sample_scheme(method, nodes, derivative, single=False)
             error = max(sum_error(kernel, scheme, cloud, edge) for cloud in DISTRIBUTIONS)
             row[str(nodes)] = float(f"{max(error, 1e-16):.2e}")

