@@ -17,8 +17,8 @@ from stokes.fmm.tree_sum import Scheme, TreeSum
 
 DISTRIBUTIONS = ("cube", "sphere", "prolate", "clustered")
 _SEED = 19870801
-_POINTS = 1500
-_TARGETS = 400
+_POINTS = 1000
+_TARGETS = 300
 
 
 def cloud(distribution: str, count: int, seed: int) -> NDArray[np.float64]:

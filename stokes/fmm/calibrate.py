@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from dem_mpi.parallel import Parallel
-from stokes.fmm.accuracy import DISTRIBUTIONS, cloud, sample_scheme, sum_error
+from stokes.fmm.accuracy import cloud, sample_scheme, sum_error
 from stokes.fmm.choice import SAMPLE_EDGES, row_name
 from stokes.fmm.kernels import KERNELS, Kernel, laplace, stokeslet
 from stokes.fmm.near_field import NearField
@@ -26,12 +26,14 @@ from stokes.fmm.tree import Splitting
 from stokes.fmm.tree_sum import Scheme, TreeSum
 
 _NODES = {
-    "equispaced": (3, 4, 5, 6, 7, 8, 9, 10, 12, 14, 16),
+    "equispaced": (3, 4, 5, 6, 7, 8, 10, 12, 14),
     "chebyshev": (3, 4, 6, 8, 10),
 }
 _METHODS = {"equispaced": "ufmm", "chebyshev": "symmetric"}
+# The largest errors were those of the cube in all comparisons, clustered clouds' the smallest.
+_CLOUDS = ("cube", "sphere")
 _REPEATS = 5
-_SMALLEST = 1e-13  # no smaller errors are of interest
+_SMALLEST = 1e-10  # no smaller errors are of interest
 
 
 def main() -> None:
@@ -78,7 +80,7 @@ def errors_of(kernel: Kernel, grids: Sequence[str]) -> dict[str, dict[str, float
         method = _METHODS[grid]
         for nodes in _NODES[grid]:
             scheme = sample_scheme(method, nodes, derivative, single=False)
-            error = max(sum_error(kernel, scheme, cloud, edge) for cloud in DISTRIBUTIONS)
+            error = max(sum_error(kernel, scheme, where, edge) for where in _CLOUDS)
             row[str(nodes)] = float(f"{max(error, 1e-16):.2e}")
             if error > 10.0 * min(row.values()) or error < _SMALLEST:
                 break
@@ -91,7 +93,7 @@ def errors_of(kernel: Kernel, grids: Sequence[str]) -> dict[str, dict[str, float
 def round_off_of(kernel: Kernel) -> float:
     """What single precision adds to the error, in 7 nodes."""
     worst = 0.0
-    for distribution in DISTRIBUTIONS:
+    for distribution in _CLOUDS:
         edge = None if kernel.homogeneous else 2.0
         single = sum_error(kernel, sample_scheme("ufmm", 7, "exact", True), distribution, edge)
         double = sum_error(kernel, sample_scheme("ufmm", 7, "exact", False), distribution, edge)

@@ -32,10 +32,11 @@ from stokes.fmm.tree_sum import Scheme
 # Errors are measured on small clouds: a plan aims at this fraction of the asked one.
 SAFETY = 0.6
 # Most nodes tried. Equispaced polynomials lose a digit to round-off every 3 nodes.
-MOST_NODES = {"ufmm": 16, "bbfmm": 20, "symmetric": 20}
+MOST_NODES = {"ufmm": 18, "bbfmm": 20, "symmetric": 20}
 _LEAST_NODES = 3
+_BEYOND_TABLE = 4
 # Edges of clouds, in kernel lengths, for which errors of kernels with a length are measured.
-SAMPLE_EDGES = (0.5, 2.0, 8.0, 32.0)
+SAMPLE_EDGES = (0.5, 4.0, 32.0)
 # Keys on which leaf sizes are compared; of more points a part is drawn by its keys.
 _SAMPLE = 1 << 17
 _FINEST_SAMPLED_LEAF = 8
@@ -195,7 +196,7 @@ def sampled_edges(kernel: Kernel, edge: float) -> list[float | None]:
     """
     if kernel.homogeneous:
         return [None]
-    return [size for size in SAMPLE_EDGES if size <= 2.0 * edge][-3:] or [SAMPLE_EDGES[0]]
+    return [size for size in SAMPLE_EDGES if size <= 2.0 * edge][-2:] or [SAMPLE_EDGES[0]]
 
 
 def _is_built_in(kernel: Kernel) -> bool:
@@ -205,9 +206,17 @@ def _is_built_in(kernel: Kernel) -> bool:
 
 
 def _interpolated(table: dict[int, float], nodes: int) -> float:
-    """log-linear between the nodes of the table, constant beyond them."""
+    """log-linear between the nodes of the table; a few beyond its end, as it falls there.
+
+    Not below 3e-11: what round-off leaves of sums on grids of so many nodes.
+    """
     known = sorted(table)
-    return float(np.exp(np.interp(nodes, known, [np.log(table[k]) for k in known])))
+    logs = np.log([table[k] for k in known])
+    if nodes <= known[-1]:
+        return float(np.exp(np.interp(nodes, known, logs)))
+    slope = (logs[-1] - logs[-2]) / (known[-1] - known[-2])
+    further = min(nodes - known[-1], _BEYOND_TABLE)
+    return max(float(np.exp(logs[-1] + min(slope, 0.0) * further)), 3e-11)
 
 
 def _enough_nodes(errors: Errors, eps: float) -> _Far:

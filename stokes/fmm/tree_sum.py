@@ -238,19 +238,35 @@ class TreeSum:
 
     def apply(self, weights: NDArray) -> NDArray:
         """Collective. Sums (m, n_out, r) of weights (n, n_in, r), in the caller's order."""
-        results = [self._apply_one(weights[:, :, c]) for c in range(weights.shape[2])]
-        return np.stack(results, axis=2)
-
-    def _apply_one(self, weights: NDArray) -> NDArray:
-        """One right-hand side: upward, transfers, downward, near field."""
         stage = partial(self._timed, self.apply_seconds)
+        columns = weights.shape[2]
         with stage("distribute"):
-            w = self.points.scatter_weights(weights)
+            w = self.points.scatter_weights(weights.transpose(0, 2, 1))
+        values = np.zeros((columns, self.kernel.n_out, self._x_targets.shape[1]))
+        for column in range(columns):
+            self._add_far(w[column], values[column])
+        with stage("near"):
+            targets, start, sources = self._near
+            one = columns == 1
+            self._points_on_points.add(
+                self._x_targets,
+                targets,
+                self._x_sources,
+                w[0] if one else w,
+                start,
+                sources,
+                values[0] if one else values,
+            )
+        with stage("distribute"):
+            return self.points.gather(self._factor * values).transpose(0, 2, 1)
+
+    def _add_far(self, w: NDArray, values: NDArray) -> None:
+        """Upward, transfers, downward for one right-hand side, all but the near field."""
+        stage = partial(self._timed, self.apply_seconds)
         with stage("upward"):
             multipoles = self._upward(w)
         with stage("exchange"):
             self.points.complete_multipoles(multipoles)
-        values = np.zeros((self.kernel.n_out, self._x_targets.shape[1]))
         with stage("far"):
             local = self._transfers(multipoles)
         with stage("source_to_local"):
@@ -259,13 +275,6 @@ class TreeSum:
             self._downward(local, values)
         with stage("multipole_to_target"):
             self._add_grids_on_points(multipoles, values)
-        with stage("near"):
-            targets, start, sources = self._near
-            self._points_on_points.add(
-                self._x_targets, targets, self._x_sources, w, start, sources, values
-            )
-        with stage("distribute"):
-            return self.points.gather(self._factor * values)
 
     def _upward(self, w: NDArray) -> NDArray:
         """P2M at this rank's leaves, M2M to the root: multipoles (nb, n_in, nodes^3)."""
