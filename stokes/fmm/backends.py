@@ -85,7 +85,8 @@ class Fmm3d:
         if self._kernel.name == "stokeslet":
             wanted = {"ifppreg": int(at_sources), "ifppregtarg": int(not at_sources)}
             result = self._library.stfmm3d(eps=eps, sources=sources, stoklet=w, **where, **wanted)
-            return result.pot if at_sources else result.pottarg
+            sums = result.pot if at_sources else result.pottarg
+            return sums.reshape(3, -1)  # version 2.1 gives (1, 3, m)
         gradient = self._kernel.name == "laplace_gradient"
         level = 2 if gradient else 1
         wanted = {"pg": level if at_sources else 0, "pgt": 0 if at_sources else level}
