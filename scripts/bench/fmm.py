@@ -30,6 +30,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterable
+from hashlib import sha1
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -105,14 +106,16 @@ _VERSION: dict[str, str] = {}
 
 
 def own_version() -> str:
-    """The commit in which the package was last changed, + if it differs from it."""
+    """The commit in which the package was last changed, + and a digest if it differs from it."""
     if "fmm" not in _VERSION:
 
         def git(*command: str) -> str:
             call = ["git", "-C", str(ROOT), *command, "--", "stokes/fmm"]
             return subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
 
-        _VERSION["fmm"] = git("log", "-1", "--format=%h") + ("+" if git("diff", "HEAD") else "")
+        changes = git("diff", "HEAD")
+        mark = "+" + sha1(changes.encode()).hexdigest()[:6] if changes else ""
+        _VERSION["fmm"] = git("log", "-1", "--format=%h") + mark
     return _VERSION["fmm"]
 
 

@@ -138,7 +138,8 @@ def _fmm3d(task: dict[str, Any]) -> dict[str, Any]:
 
     def apply(x: NDArray, w: NDArray, eps: float) -> NDArray:
         if stokes:
-            return fmm3dpy.stfmm3d(eps=eps, sources=x, stoklet=w, ifppreg=1).pot.T
+            # version 2.1 gives (1, 3, n)
+            return fmm3dpy.stfmm3d(eps=eps, sources=x, stoklet=w, ifppreg=1).pot.reshape(3, -1).T
         return fmm3dpy.lfmm3d(eps=eps, sources=x, charges=w[0], pg=1).pot[:, None]
 
     before = _memory()
