@@ -294,8 +294,8 @@ def _report_lines(
     v, gamma = cone.velocity_scale, cone.impulse_scale
     outcome = "converged" if report.converged else f"NOT CONVERGED: {report.reason}"
     kind = "Newton iterations" if solver == "scip" else "iterations"
-    if solver == "auto" and law == "ccp":  # Coulomb's law has factorisations of its own
-        kind += f", {report.factorisations} of them Newton's"
+    if solver != "scip" and report.factorisations:
+        kind += f" ({report.factorisations} of them Newton's)"
     plural = "s" if report.outer > 1 else ""
     rounds = f" in {report.outer} cone problem{plural}" if law == "coulomb" else ""
     if report.converged and not report.iterations:

@@ -109,8 +109,9 @@ class Coulomb:
         """Collective. Solve from `guess` (m, columns) [N s], which is taken over, not copied.
 
         Velocity and residuals of the report are those of the law, with the problem's own b; counts
-        are sums over the cone problems solved, and `history` has a row for each of these, with the
-        iterations up to its end. A problem without friction is handed on as it is.
+        are sums over the cone problems solved and the Newton steps on the law. `history` has a row
+        for each cone problem, with the iterations up to its end. A problem without friction is
+        handed on as it is.
         """
         options, parallel = self.options, problem.parallel
         tolerance = tolerance or self.tolerance
@@ -443,7 +444,8 @@ class _Totals:
         )
 
     def add_newton(self, found: Found) -> None:
-        """Count the linear systems of Newton's method on the law; seconds are counted elsewhere."""
+        """Count the iterations of Newton's method on the law; its seconds are counted elsewhere."""
+        self.iterations += found.factorisations
         self.products += found.products
         self.factorisations += found.factorisations
         self.refinements += found.refinements

@@ -546,6 +546,7 @@ def test_newton_steps_end_a_solve_whose_cone_problems_ran_out(parallel):
     assert report.converged, report.reason
     assert (report.outer, report.solver, report.form) == (2, "apgd", "contact")
     assert report.factorisations >= 1
+    assert report.iterations == report.history[-1, 0] + report.factorisations
     assert report.factor_entries >= 9 * parallel.sum(problem.contacts)
     # Of direct solves in double precision: some 1e-13 at the conditions of these matrices.
     assert 0.0 < report.linear_residual <= 1e-8
