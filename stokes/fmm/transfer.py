@@ -26,6 +26,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from stokes.fmm import _kernels_transfer as kernels
 from stokes.fmm.kernels import Kernel
+from stokes.fmm.windows import windows
 
 _VECTORS = 343
 # Below the coarsest level of a standard tree with two boxes apart enough (4 boxes per edge).
@@ -37,6 +38,8 @@ _PAIR_COST, _PAIR_COST_SCALAR = 1.3, 2.2
 _LARGE_TABLES = 3
 # Memory for the spectra of a part of the frequencies.
 _SPECTRA_BYTES = 1 << 28
+# Sweeps over rows of values of the kernel at a time, about, when tables are made.
+_SWEEPS = 8
 # Nodes from which on each kz fills whole blocks, so that no turn computes one in part.
 _WHOLE_TURNS = 8
 
@@ -87,7 +90,7 @@ class FourierTransfer:
         self._edges = np.asarray(edges, dtype=np.float64)
         self._smooth = admissibility == "smooth"
         self._work = np.empty(0, self.dtype)
-        self._frequencies = _Frequencies(self.nodes, self._lanes, self.dtype)
+        self._frequencies = _Frequencies(self.nodes, self._lanes)
         self._stored = _stored_vectors(self._smooth, kernel.parity != 0)
         self._tables = {
             level: self._build(edge)
@@ -257,14 +260,24 @@ class FourierTransfer:
 
     def _build(self, edge: float) -> NDArray:
         """Spectra of the kernel for the stored vectors: [block][vector][component][re, im]."""
-        values = _windows(self.kernel, self._grid, edge, self._stored).astype(self.dtype)
-        n = 2 * self.nodes - 1
-        rows = _Rows(np.arange(len(values)), 1, n**3, self._lanes, exact=True)
-        part = _Part(self._frequencies, 0, self._frequencies.blocks, n, self._lanes, self.dtype)
-        table = _aligned(self._frequencies.blocks * rows.total * 2 * self._lanes, self.dtype)
-        part.forward(values, rows, table, self.threads)
-        shaped = table.reshape(self._frequencies.blocks, -1, self._lanes)
-        shaped *= self._frequencies.weight.reshape(-1, 1, self._lanes)
+        n, lanes, blocks = 2 * self.nodes - 1, self._lanes, self._frequencies.blocks
+        vectors, components = np.flatnonzero(self._stored >= 0), self.kernel.n_unique
+        total = len(vectors) * components
+        total += -total % lanes
+        table = _aligned(blocks * total * 2 * lanes, self.dtype)
+        part = _Part(self._frequencies, 0, blocks, n, lanes, self.dtype, scale=2.0 / n**3)
+        # a few vectors at a time, whole sweeps of rows: their values stay in the cache
+        step = lanes * max(1, _SWEEPS // components)
+        for first in range(0, len(vectors), step):
+            axes = _differences(self._grid, edge, vectors[first : first + step])
+            values = windows(self.kernel, axes, self.dtype)
+            rows = _Rows(np.arange(len(values)), components, n**3, lanes, exact=True)
+            begin = first * components * 2 * lanes
+            part.forward(values, rows, table[begin:], self.threads, total)
+        shaped = table.reshape(blocks, total, 2, lanes)
+        for frequency in np.flatnonzero(self._frequencies.weight != 1.0):
+            weight = self.dtype.type(self._frequencies.weight[frequency])
+            shaped[frequency // lanes, :, :, frequency % lanes] *= weight
         return table
 
 
@@ -421,17 +434,10 @@ def _stored_vectors(smooth: bool, mirrored: bool) -> NDArray:
     return stored
 
 
-def _windows(kernel: Kernel, grid: Nodes, edge: float, stored: NDArray) -> NDArray:
-    """Kernel at the differences of nodes for each stored vector: (vectors n_unique, n, n, n)."""
+def _differences(grid: Nodes, edge: float, vectors: NDArray) -> NDArray[np.float64]:
+    """Differences of the nodes of two boxes for each vector: (vectors, 3, 2 nodes - 1)."""
     difference = grid.extent * edge * np.linspace(-1.0, 1.0, 2 * grid.nodes - 1)
-    vectors = np.flatnonzero(stored >= 0)
-    n = len(difference)
-    values = np.empty((len(vectors), kernel.n_unique, n, n, n))
-    for k, v in enumerate(vectors):
-        axes = np.meshgrid(*(difference + edge * _OFFSETS[v][:, None]), indexing="ij")
-        r = np.stack(axes, axis=-1).reshape(-1, 3)
-        values[k] = kernel.unique(r).T.reshape(-1, n, n, n)
-    return values.reshape(-1, n, n, n)
+    return difference + edge * _OFFSETS[vectors][:, :, None]
 
 
 class _Frequencies:
@@ -440,10 +446,11 @@ class _Frequencies:
     With many nodes each kz begins a block.
 
     Frequencies are (kx, ky, kz) with |kx|, |ky| < l and 0 <= kz < l; of kz = 0 those with kx > 0,
-    or kx = 0 and ky >= 0.
+    or kx = 0 and ky >= 0. weight: 1 for a pair k, -k, half of it for k = 0, 0 where a block is
+    filled up.
     """
 
-    def __init__(self, nodes: int, lanes: int, dtype: np.dtype) -> None:
+    def __init__(self, nodes: int, lanes: int) -> None:
         self.nodes = nodes
         number, weight, count = -np.ones((2 * nodes - 1, 2 * nodes - 1, nodes), np.int64), [], 0
         for kz in range(nodes):
@@ -452,13 +459,12 @@ class _Frequencies:
             number[kept, kz] = count + np.arange(kept.sum())
             zero = (kx[kept] == 0) & (ky[kept] == 0) & (kz == 0)
             spare = -int(kept.sum()) % lanes if nodes >= _WHOLE_TURNS else 0
-            weight.append(np.pad(np.where(zero, 1.0, 2.0), (0, spare)))
+            weight.append(np.pad(np.where(zero, 0.5, 1.0), (0, spare)))
             count += len(weight[-1])
         self.number = number
         self.blocks = -(-count // lanes)
-        padded = np.zeros(self.blocks * lanes)
-        padded[:count] = np.concatenate(weight) / (2 * nodes - 1) ** 3
-        self.weight = padded.astype(dtype)
+        self.weight = np.zeros(self.blocks * lanes)
+        self.weight[:count] = np.concatenate(weight)
         self._lanes = lanes
         self.first = np.where(number < 0, count, number).min(axis=(0, 1))
         self.last = number.max(axis=(0, 1))
@@ -477,10 +483,20 @@ class _Frequencies:
 
 
 class _Part:
-    """Transforms between grids of some size and a range of the blocks of frequencies."""
+    """Transforms between grids of some size and a range of the blocks of frequencies.
+
+    scale : factor of the forward transform
+    """
 
     def __init__(
-        self, frequencies: _Frequencies, first: int, last: int, size: int, lanes: int, dtype
+        self,
+        frequencies: _Frequencies,
+        first: int,
+        last: int,
+        size: int,
+        lanes: int,
+        dtype: np.dtype,
+        scale: float = 1.0,
     ) -> None:
         nodes = frequencies.nodes
         n = 2 * nodes - 1
@@ -492,7 +508,7 @@ class _Part:
         x = np.arange(size) - (nodes - 1 if size == n else 0)
         angle = 2.0 * np.pi / n * np.outer(np.arange(nodes), x)
         cos, sin = np.cos(angle), np.sin(angle)
-        self._matrix_z = np.concatenate([cos[k0:k1], sin[k0:k1]]).astype(dtype)
+        self._matrix_z = (scale * np.concatenate([cos[k0:k1], sin[k0:k1]])).astype(dtype)
         self._matrix = np.concatenate([cos, sin[1:]]).astype(dtype)
         n_z = 2 * (k1 - k0)
         b = size * size * max(size, n_z) * lanes
@@ -527,13 +543,15 @@ class _Part:
         self._read_complex = np.where(complex_ < 0, zero, complex_).reshape(-1)
         self._write_complex = np.where(complex_ < 0, trash, complex_).reshape(-1)
 
-    def forward(self, values: NDArray, rows: _Rows, spectra: NDArray, threads: int) -> None:
-        """Spectra of the rows of values; those of the box after the last are zero."""
+    def forward(
+        self, values: NDArray, rows: _Rows, spectra: NDArray, threads: int, total: int = 0
+    ) -> None:
+        """Spectra of the rows of values, of `total` in a block (default: these only)."""
         work = _aligned_rows(threads, self._work, self._dtype)
         kernels.forward.using(threads)(
             values.reshape(-1), rows.offsets, self._matrix_z, self._matrix, self._size,
             self._read_real, self._write_complex, self._places, work, self._lanes, self._blocks,
-            spectra, rows.total,
+            spectra, total or rows.total,
         )  # fmt: skip
 
     def backward(
