@@ -28,18 +28,14 @@ class Direct:
 
     def apply(self, weights: NDArray) -> NDArray:
         """Collective. Sums (m, n_out, r) of weights (n, n_in, r)."""
-        sums = [
-            direct_sum(
-                self._kernel,
-                self._sources,
-                self._targets,
-                np.ascontiguousarray(weights[:, :, column]),
-                parallel=self._parallel,
-                threads=self._threads,
-            )
-            for column in range(weights.shape[2])
-        ]
-        return np.stack(sums, axis=2)
+        return direct_sum(
+            self._kernel,
+            self._sources,
+            self._targets,
+            weights,
+            parallel=self._parallel,
+            threads=self._threads,
+        )
 
 
 class Fmm3d:

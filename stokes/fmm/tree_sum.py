@@ -125,7 +125,7 @@ class TreeSum:
         self.boxes = points.boxes
         self._root_edge = 1.0 if kernel.homogeneous else points.edge / kernel.length
         unit = points.edge / self._root_edge
-        self._factor = kernel.factor * unit ** (kernel.degree or 0.0)
+        self._factor = kernel.factor * (unit / kernel.length) ** (kernel.degree or 0.0)
         self._x_sources = _inside(points.x_sources, points.origin, unit)
         self._x_targets = (
             self._x_sources
@@ -137,7 +137,9 @@ class TreeSum:
         self._gradient = kernel.derivative if interpolated else None
         self._far = self._inner
         if interpolated:
-            self._far = dataclasses.replace(kernel.base, length=1.0, factor=1.0)
+            # f k(r/l) is the gradient of f' k'(r/l): so is k(r) of f'/(f l) k'(r)
+            factor = kernel.base.factor / (kernel.factor * kernel.length)
+            self._far = dataclasses.replace(kernel.base, length=1.0, factor=factor)
 
     def _set_tables(self, threads: int) -> None:
         scheme = self.scheme
