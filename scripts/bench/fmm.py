@@ -197,7 +197,7 @@ def growth(records: list[Record]) -> Iterable[Record]:
     """Exponents of seconds in points, by kernel, accuracy and distribution."""
     series: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for r in records:
-        if r.name.count(".") == 2 and r.ranks == 1 and "n" in r.params and r.rival:
+        if _compared(r) and r.ranks == 1:
             key = (r.name, r.params["distribution"])
             series.setdefault(key, []).append((r.params["n"], r.value))
     for (name, distribution), found in series.items():
@@ -279,55 +279,103 @@ def limits(quick: bool) -> Iterable[Record]:
 
 
 def draw(records: list[Record], path: Path) -> None:
-    """Work-precision, gain over the rival, grids against the order, growth with the points."""
+    """Work-precision, gain over the rival, growth; grids against the order, smooth kernels."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(2, 3, figsize=(14, 8), constrained_layout=True)
+    figure, axes = plt.subplots(2, 4, figsize=(18, 8), constrained_layout=True)
     for axis, kernel in zip(axes[0], KERNELS, strict=False):
-        of = [r for r in records if r.name == f"fmm.curve.{kernel}"]
-        for label in dict.fromkeys(r.params["label"] for r in of):
-            line = sorted((r.error, r.value) for r in of if r.params["label"] == label)
-            axis.loglog(*zip(*line, strict=True), "o-", label=label)
-        axis.set(xlabel="relative error (2-norm)", ylabel="seconds, one core",
-                 title=f"{kernel}: 10⁵ points in a cube")  # fmt: skip
-        axis.invert_xaxis()
-        axis.legend()
-    axis = axes[0, 2]
-    for kernel in KERNELS:
-        for n in (10_000, 100_000, 1_000_000):
-            line = [(r.error, 1.0 / r.ratio) for r in records
-                    if r.name.startswith(f"fmm.{kernel}.1e") and r.name.count(".") == 2
-                    and r.ratio and r.params["n"] == n and r.ranks == 1
-                    and r.params["distribution"] == "cube"]  # fmt: skip
-            if line:
-                axis.semilogx(*zip(*sorted(line), strict=True), "o-", label=f"{kernel}, {n:,}")
-    axis.axhline(1.0, color="k", lw=0.8)
-    axis.invert_xaxis()
-    axis.set(xlabel="relative error", ylabel="FMM3D's seconds over ours", title="cube, one core")
-    axis.legend(fontsize=8)
-    for axis, name in zip(axes[1], ("apply", "plan"), strict=False):
-        of = [r for r in records if r.name == f"fmm.grids.{name}"]
-        for key in dict.fromkeys((r.params["kernel"], r.params["options"]["method"]) for r in of):
-            line = [(r.params["order"], r.value) for r in of
-                    if (r.params["kernel"], r.params["options"]["method"]) == key]  # fmt: skip
-            axis.semilogy(*zip(*line, strict=True), "o-", label=" ".join(key))
-        axis.set(xlabel="order", ylabel="seconds", title=f"{name}: 20,000 points, depth 3")
-        axis.legend(fontsize=8)
-    axis = axes[1, 2]
-    for kernel in KERNELS:
-        for asked in ("1e-3", "1e-6", "1e-9"):
-            of = [r for r in records if r.name == f"fmm.{kernel}.{asked}" and r.ranks == 1
-                  and r.params["distribution"] == "cube"]  # fmt: skip
-            if of:
-                line = sorted((r.params["n"], r.value) for r in of)
-                axis.loglog(*zip(*line, strict=True), "o-", label=f"{kernel} {asked}")
-    axis.set(xlabel="points", ylabel="seconds, one core", title="growth")
-    axis.legend(fontsize=8)
+        _draw_curve(axis, kernel, [r for r in records if r.name == f"fmm.curve.{kernel}"])
+    cube = [r for r in records if _compared(r) and r.params["distribution"] == "cube"
+            and r.ranks == 1]  # fmt: skip
+    _draw_gain(axes[0, 2], cube)
+    _draw_growth(axes[0, 3], cube)
+    _draw_grids(axes[1, 0], records, "apply")
+    _draw_grids(axes[1, 1], records, "plan")
+    _draw_tables(axes[1, 2], records)
+    _draw_smooth(axes[1, 3], [r for r in records if r.name == "fmm.smooth"])
+    for axis in axes.flat:
+        if axis.has_data():
+            axis.legend(fontsize=8)
+        else:
+            axis.set_axis_off()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _compared(record: Record) -> bool:
+    """Whether it is a sum of ours at an accuracy that the rival was asked for."""
+    _, *kind = record.name.split(".")
+    return len(kind) == 2 and kind[0] in KERNELS and kind[1] in ("1e-3", "1e-6", "1e-9")
+
+
+def _draw_curve(axis: Any, kernel: str, found: list[Record]) -> None:
+    for label in dict.fromkeys(r.params["label"] for r in found):
+        line = sorted((r.error, r.value) for r in found if r.params["label"] == label)
+        axis.loglog(*zip(*line, strict=True), "o-", label=label)
+    if found:
+        axis.axhline(found[0].params["direct_seconds"], color="k", lw=0.8, ls=":", label="direct")
+        axis.set(title=f"{kernel}: {found[0].params['n']:,} points in a cube")
+    axis.set(xlabel="relative error (2-norm)", ylabel="seconds an application, one core")
+    axis.invert_xaxis()
+
+
+def _draw_gain(axis: Any, found: list[Record]) -> None:
+    found = [r for r in found if r.ratio]
+    for kernel, n in dict.fromkeys((r.params["kernel"], r.params["n"]) for r in found):
+        line = sorted((r.error, 1.0 / r.ratio) for r in found
+                      if (r.params["kernel"], r.params["n"]) == (kernel, n))  # fmt: skip
+        axis.semilogx(*zip(*line, strict=True), "o-", label=f"{kernel}, {n:,}")
+    if found:
+        axis.axhline(1.0, color="k", lw=0.8)
+    axis.invert_xaxis()
+    axis.set(xlabel="relative error (2-norm)", ylabel="FMM3D's seconds over ours",
+             title="cube, one core")  # fmt: skip
+
+
+def _draw_growth(axis: Any, found: list[Record]) -> None:
+    for name in dict.fromkeys(r.name for r in found):
+        line = sorted((r.params["n"], r.value) for r in found if r.name == name)
+        axis.loglog(*zip(*line, strict=True), "o-", label=name.removeprefix("fmm."))
+    axis.set(xlabel="points in a cube", ylabel="seconds an application, one core", title="growth")
+
+
+def _draw_grids(axis: Any, records: list[Record], name: str) -> None:
+    for label, of in _by_grid(records, name).items():
+        axis.semilogy([r.params["order"] for r in of], [r.value for r in of], "o-", label=label)
+    axis.xaxis.get_major_locator().set_params(integer=True)
+    axis.set(xlabel="order", ylabel="seconds", title=f"{name}: {GRID_POINTS:,} points, 3 levels")
+
+
+def _draw_tables(axis: Any, records: list[Record]) -> None:
+    for label, of in _by_grid(records, "apply").items():
+        megabytes = [1e-6 * r.params["tables"]["tables"] for r in of]
+        axis.semilogy([r.params["order"] for r in of], megabytes, "o-", label=label)
+    axis.xaxis.get_major_locator().set_params(integer=True)
+    axis.set(xlabel="order", ylabel="MB", title="memory of the operators")
+
+
+def _by_grid(records: list[Record], name: str) -> dict[str, list[Record]]:
+    lines: dict[str, list[Record]] = {}
+    for r in records:
+        if r.name == f"fmm.grids.{name}":
+            label = f"{r.params['kernel']}, {r.params['options']['method']}"
+            lines.setdefault(label, []).append(r)
+    return lines
+
+
+def _draw_smooth(axis: Any, found: list[Record]) -> None:
+    n = [r.params["n"] for r in found]
+    if found:
+        axis.loglog(n, [r.value for r in found], "o-", label="without a near field")
+    told = [(r.params["n"], r.rival_value) for r in found if r.rival_value]
+    if told:
+        axis.loglog(*zip(*told, strict=True), "o-", label="standard")
+    axis.set(xlabel="points in a cube", ylabel="seconds an application, one core",
+             title=f"Gaussian of length {SMOOTH_LENGTH}, eps 1e-6")  # fmt: skip
 
 
 def table(records: list[Record]) -> str:
@@ -339,7 +387,7 @@ def table(records: list[Record]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for r in records:
-        if r.name.count(".") != 2 or not r.name.endswith(("1e-3", "1e-6", "1e-9")):
+        if not _compared(r):
             continue
         p = r.params
         told = f"{r.rival_value:.3g} | {1.0 / r.ratio:.2g}" if r.ratio else "- | -"
