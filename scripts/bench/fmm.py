@@ -300,7 +300,7 @@ def draw(records: list[Record], path: Path) -> None:
         if axis.has_data():
             axis.legend(fontsize=8)
         else:
-            axis.set_axis_off()
+            axis.set_visible(False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
