@@ -35,6 +35,9 @@ SAFETY = 0.6
 MOST_NODES = {"ufmm": 18, "bbfmm": 20, "symmetric": 20}
 _LEAST_NODES = 3
 _BEYOND_TABLE = 4
+# Sums without near field: most points that are summed sooner than samples are taken, deepest
+# tree, largest leaf in kernel lengths.
+_WORTH_SAMPLES, _SMOOTH_DEPTHS, _SMOOTH_EDGE = 50_000, 5, 2.0
 # Edges of clouds, in kernel lengths, for which errors of kernels with a length are measured.
 SAMPLE_EDGES = (0.5, 4.0, 32.0)
 # Keys on which leaf sizes are compared; of more points a part is drawn by its keys.
@@ -78,16 +81,20 @@ def choose(
 ) -> Choice:
     """Collective. What a plan for these points, this kernel and this error is made of."""
     origin, edge = _cube(sources, targets, parallel)
-    far, why = _choose_far(kernel, eps, options, edge / kernel.length)
-    admissibility = "standard" if options.admissibility == "auto" else options.admissibility
+    edge /= kernel.length
+    far, why = _choose_far(kernel, eps, options, edge)
+    total = max(parallel.sum(len(points)) for points in (sources, targets))
+    if _may_be_smooth(kernel, far, options, total):
+        smooth = _smooth_plan(kernel, eps, options, edge, total)
+        if smooth is not None:
+            return smooth
     direct_below = far.nodes**3
     if options.depth is not None:
         splitting = Splitting(depth=options.depth)
     elif options.leaf_size is not None:
         splitting = Splitting(leaf_size=options.leaf_size)
     else:
-        keys = [_sample(points, origin, edge, parallel) for points in (sources, targets)]
-        stride = max(stride for _, stride in keys)
+        keys, stride = _sample([sources, targets], origin, edge * kernel.length, parallel)
         cost = Cost(kernel, far.method, far.nodes, far.derivative, far.single)
         splitting = Splitting(leaf_size=_best_leaf(keys, stride, cost, direct_below))
     scheme = Scheme(
@@ -96,11 +103,80 @@ def choose(
         splitting=splitting,
         single=far.single,
         derivative=far.derivative,
-        admissibility=admissibility,
-        direct_below=0 if admissibility == "smooth" else direct_below,
+        direct_below=direct_below,
         operator_eps=operator_eps(far.nodes),
     )
     return Choice(scheme, far.error, why)
+
+
+# ---- kernels smooth at the origin ---------------------------------------------------------------
+
+
+def _may_be_smooth(kernel: Kernel, far: _Far, options: FmmOptions, points: int) -> bool:
+    """Whether a sum without near field is asked for, or worth the samples that it takes."""
+    if options.admissibility != "auto":
+        return options.admissibility == "smooth"
+    free = options.leaf_size is None and options.depth is None and options.order is None
+    return kernel.smooth and free and far.method == "ufmm" and points >= _WORTH_SAMPLES
+
+
+def _smooth_plan(
+    kernel: Kernel, eps: float, options: FmmOptions, edge: float, points: int
+) -> Choice | None:
+    """The cheapest uniform tree without near field; None if none reaches the error by itself.
+
+    Transfers are between all 343 neighbours at the leaves; fewer nodes do as leaves shrink.
+    """
+    method = "ufmm" if options.method == "auto" else options.method
+    asked = options.admissibility == "smooth"
+    depths = [options.depth] if options.depth is not None else range(1, _SMOOTH_DEPTHS + 1)
+    best: tuple[float, Choice] | None = None
+    for depth in depths:
+        leaf_edge = edge * 0.5**depth
+        if options.depth is None and leaf_edge > _SMOOTH_EDGE:
+            continue
+        nodes, error = _smooth_nodes(kernel, method, eps, options, leaf_edge)
+        scheme = Scheme(
+            method=method,
+            nodes=nodes,
+            splitting=Splitting(depth=depth),
+            admissibility="smooth",
+            operator_eps=operator_eps(nodes),
+        )
+        choice = Choice(scheme, error, "the kernel is smooth at the origin: no near field")
+        cost = Cost(kernel, method, nodes, "exact", single=False).smooth(depth, points)
+        reached = error <= SAFETY * eps or options.order is not None or options.depth is not None
+        if reached and (best is None or cost < best[0]):
+            best = (cost, choice)
+    if best is None and asked:
+        raise ValueError(
+            f"kernel {kernel.name}: no tree of at most {_SMOOTH_DEPTHS} levels reaches {eps:.0e} "
+            f"without near field over a cube of {edge:.3g} kernel lengths; give `depth`, or the "
+            "admissibility 'standard'"
+        )
+    return None if best is None else best[1]
+
+
+def _smooth_nodes(
+    kernel: Kernel, method: str, eps: float, options: FmmOptions, leaf_edge: float
+) -> tuple[int, float]:
+    """Fewest nodes, and their error, of a sample of 2^3 leaves that all touch."""
+    found = (0, np.inf)
+    nodes = [options.order + 1] if options.order else range(_LEAST_NODES, 15)
+    for count in nodes:
+        scheme = Scheme(
+            method=method,
+            nodes=count,
+            splitting=Splitting(depth=1),
+            admissibility="smooth",
+            operator_eps=operator_eps(count),
+        )
+        error = sum_error(kernel, scheme, "cube", 2.0 * leaf_edge)
+        if error < found[1]:
+            found = (count, error)
+        if error <= SAFETY * eps:
+            break
+    return found
 
 
 # ---- error ------------------------------------------------------------------------------------
@@ -196,7 +272,8 @@ def sampled_edges(kernel: Kernel, edge: float) -> list[float | None]:
     """
     if kernel.homogeneous:
         return [None]
-    return [size for size in SAMPLE_EDGES if size <= 2.0 * edge][-2:] or [SAMPLE_EDGES[0]]
+    enough = next((k for k, size in enumerate(SAMPLE_EDGES) if size >= edge), len(SAMPLE_EDGES))
+    return list(SAMPLE_EDGES[max(0, enough - 1) : enough + 1])
 
 
 def _is_built_in(kernel: Kernel) -> bool:
@@ -281,8 +358,11 @@ class Cost:
         else:
             self.transfer = ns["matrix"] * nodes**4 * entries
 
-    def of(self, boxes: Boxes, direct_below: int, stride: int) -> float:
-        """Nanoseconds with the tree of the points of which every stride-th is in `boxes`."""
+    def of(self, boxes: Boxes, direct_below: int, stride: int) -> tuple[float, float]:
+        """Nanoseconds (near, far) with the tree of the points, one in `stride` of them in `boxes`.
+
+        far: of all that is done box by box.
+        """
         lists = interaction_lists(boxes, direct_below=direct_below)
         count = (boxes.target_count.astype(float), boxes.source_count.astype(float))
         nodes = self.nodes**3 / stride
@@ -295,11 +375,14 @@ class Cost:
         work = min(1.6, 29.7 / siblings**2) * len(lists.far)
         points = 0.5 * (count[0][0] + count[1][0])
         return (
-            self.near * pairs * stride**2
-            + self.transfer * work
-            + self.passes * len(boxes)
-            + self.points * points * stride
+            self.near * pairs * stride**2 + self.points * points * stride,
+            self.transfer * work + self.passes * len(boxes),
         )
+
+    def smooth(self, depth: int, points: int) -> float:
+        """Nanoseconds of a full uniform tree whose leaves have all 343 transfers."""
+        boxes = 8.0**depth
+        return (343.0 * self.transfer + 1.15 * self.passes) * boxes + self.points * points
 
 
 def _point_pairs(pairs: Pairs, of_target: NDArray, of_source: NDArray) -> float:
@@ -307,49 +390,47 @@ def _point_pairs(pairs: Pairs, of_target: NDArray, of_source: NDArray) -> float:
     return float(np.sum(of_target[pairs.target()] * of_source[pairs.source]))
 
 
-def _best_leaf(keys: list[tuple[NDArray, int]], stride: int, cost: Cost, direct_below: int) -> int:
-    """The cheapest of leaf sizes by factors of sqrt 2, from a first guess downhill."""
-    sources, targets = keys[0][0], keys[1][0]
+def _best_leaf(keys: list[NDArray], stride: int, cost: Cost, direct_below: int) -> int:
+    """The cheapest of leaf sizes by factors of sqrt 2, from the largest down.
+
+    More boxes take longer in the far field, by their number at least: trees are refined until
+    that alone would take longer than the best of them.
+    """
     smallest = max(_SMALLEST_LEAF, _FINEST_SAMPLED_LEAF * stride if stride > 1 else 0)
-    known: dict[int, float] = {}
-
-    def nanoseconds(step: int) -> float:
+    best, fastest, known, far = _LARGEST_LEAF, np.inf, 0, 0.0
+    low, high = (int(np.ceil(2.0 * np.log2(leaf))) for leaf in (smallest, _LARGEST_LEAF))
+    for step in range(max(low, high), low - 1, -1):
         leaf = round(2.0 ** (0.5 * step))
-        if step not in known:
-            boxes = build(sources, targets, Splitting(leaf_size=max(1, leaf // stride)))
-            known[step] = cost.of(boxes, direct_below // stride, stride)
-        return known[step]
-
-    low = int(np.ceil(2.0 * np.log2(smallest)))
-    high = max(low, int(2.0 * np.log2(_LARGEST_LEAF)))
-    guess = int(np.clip(_guess(cost), low, high))
-    # two octaves about the guess: trees over volumes change by factors of 8
-    steps = [step for step in range(guess - 6, guess + 7, 2) if low <= step <= high]
-    best = min(steps, key=nanoseconds)
-    return round(2.0 ** (0.5 * best))
-
-
-def _guess(cost: Cost) -> int:
-    """Twice the binary logarithm of the leaf size that balances U and V in a full tree."""
-    per_box = 90.0 * cost.transfer + cost.passes
-    return round(2.0 * np.log2(np.sqrt(per_box / (27.0 * cost.near))))
+        boxes = build(*keys, Splitting(leaf_size=max(1, leaf // stride)))
+        if len(boxes) == known:
+            continue  # trees contain each other: it is the same
+        if far * len(boxes) >= fastest * known:
+            break
+        near, far = cost.of(boxes, direct_below // stride, stride)
+        known = len(boxes)
+        if near + far < fastest:
+            best, fastest = leaf, near + far
+    return best
 
 
 def _sample(
-    points: NDArray, origin: NDArray, edge: float, parallel: Parallel
-) -> tuple[NDArray[np.int64], int]:
+    point_sets: list[NDArray], origin: NDArray, edge: float, parallel: Parallel
+) -> tuple[list[NDArray[np.int64]], int]:
     """Collective. Rising Morton keys of a part of all ranks' points, and one in how many it is.
 
     Points are drawn by a hash of their keys: which ones does not depend on ranks or order.
     """
-    keys = morton.encode(points, origin, edge)
-    total = parallel.sum(len(keys))
-    stride = 1 << max(0, int(np.ceil(np.log2(max(total, 1) / _SAMPLE))))
-    if stride > 1:
-        mixed = keys.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
-        keys = keys[(mixed >> np.uint64(40)) % np.uint64(stride) == 0]
-    gathered = parallel.broadcast(parallel.gather(keys))
-    return np.sort(np.concatenate(gathered)), stride
+    one_set = not parallel.any(point_sets[0] is not point_sets[1])
+    keys = [morton.encode(x, origin, edge) for x in point_sets[: 1 if one_set else 2]]
+    most = max(parallel.sum(len(k)) for k in keys)
+    stride = 1 << max(0, int(np.ceil(np.log2(max(most, 1) / _SAMPLE))))
+    samples = []
+    for drawn in keys:
+        if stride > 1:
+            mixed = drawn.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+            drawn = drawn[(mixed >> np.uint64(40)) % np.uint64(stride) == 0]
+        samples.append(np.sort(np.concatenate(parallel.broadcast(parallel.gather(drawn)))))
+    return [samples[0], samples[-1]], stride
 
 
 def _cube(

@@ -10,7 +10,6 @@ Method = Literal["auto", "ufmm", "bbfmm", "symmetric"]
 Precision = Literal["auto", "double", "single"]
 Derivative = Literal["auto", "exact", "interpolated"]
 Admissibility = Literal["auto", "standard", "smooth"]
-Near = Literal["auto", "cached", "recomputed"]
 Backend = Literal["own", "fmm3d", "direct"]
 
 
@@ -27,9 +26,9 @@ class FmmOptions:
     precision     : of the far field and, in single, of the near field's pairs
     derivative    : a kernel that is a gradient of another: "exact" transfers the gradient itself,
                     "interpolated" transfers the other kernel and differentiates the interpolation
-    admissibility : "smooth" transfers between touching leaves too: no near field. Only for
-                    kernels smooth at the origin; "auto" takes "standard" unless `depth` is given
-    near          : "cached" stores the near field's matrices for later applications
+    admissibility : "smooth" transfers between touching leaves too, and has no near field: for
+                    kernels smooth at the origin, in boxes not much larger than their length.
+                    "auto" takes it for such kernels where the cost model finds it cheaper
     threads       : of this rank
     """
 
@@ -40,7 +39,6 @@ class FmmOptions:
     precision: Precision = "auto"
     derivative: Derivative = "auto"
     admissibility: Admissibility = "auto"
-    near: Near = "auto"
     backend: Backend = "own"
     threads: int = 1
 
