@@ -76,7 +76,7 @@ def test_leaf_is_near_the_cheapest():
 
         def nanoseconds(leaf, cost=cost, keys=keys, scheme=scheme):
             boxes = build(keys, keys, Splitting(leaf_size=leaf))
-            return cost.of(boxes, scheme.direct_below, 1)
+            return sum(cost.of(boxes, scheme.direct_below, 1))
 
         best = min(nanoseconds(leaf) for leaf in (16, 32, 64, 128, 256, 512, 1024))
         assert nanoseconds(scheme.splitting.leaf_size) <= 1.15 * best
@@ -86,6 +86,18 @@ def test_plan_does_not_depend_on_the_order_of_the_points():
     x = cloud("sphere", 200_000, 1)
     one = choice(laplace, x, 1e-4)
     assert choice(laplace, np.random.default_rng(1).permutation(x), 1e-4) == one
+
+
+def test_smooth_kernel_needs_no_near_field_in_boxes_of_its_length():
+    """A wide Gaussian over many points: transfers between touching leaves; few points: not."""
+    kernel = KERNELS["gaussian"]
+    many = choice(kernel, cloud("cube", 60_000, 1), 1e-6)
+    assert many.scheme.admissibility == "smooth"
+    assert many.expected_error <= SAFETY * 1e-6
+    assert choice(kernel, cloud("cube", 1000, 1), 1e-6).scheme.admissibility == "standard"
+    assert choice(laplace, cloud("cube", 60_000, 1), 1e-6).scheme.admissibility == "standard"
+    with pytest.raises(ValueError, match="no tree"):
+        choice(kernel, 1e4 * cloud("cube", 1000, 1), 1e-6, admissibility="smooth")
 
 
 @register_jitable
