@@ -25,11 +25,12 @@ def mark_ancestors(parent, wanted):
 
 
 @jit
-def same_level(parent, children, leaf, cell, source_count, wanted, smooth, opened):
+def same_level(parent, children, leaf, cell, source_count, wanted, smooth, counted, opened):
     """Pairs of boxes of one level: colleague_start, colleague, far_start, far, vector.
 
     Colleagues are the source boxes that touch the target box or are it; far ones are the other
     children of the parent's colleagues. With `smooth`, a touching pair with a leaf in it is far.
+    With `counted`, far and vector are left empty; far_start is that of the pairs there would be.
     Sets `opened` of source boxes whose children were looked at.
     """
     n = len(parent)
@@ -39,7 +40,8 @@ def same_level(parent, children, leaf, cell, source_count, wanted, smooth, opene
     near_end, far_end = 0, 0
     if wanted[0] and source_count[0] > 0:
         if smooth and leaf[0]:
-            far[0], vector[0] = 0, _vector(cell, 0, 0)
+            if not counted:
+                far[0], vector[0] = 0, _vector(0, 0, 0)
             far_end = 1
         else:
             colleague[0] = 0
@@ -48,30 +50,38 @@ def same_level(parent, children, leaf, cell, source_count, wanted, smooth, opene
     for b in range(1, n):
         if wanted[b]:
             colleague = _with_room(colleague, near_end, MAX_COLLEAGUES)
-            far = _with_room(far, far_end, MAX_FAR)
-            vector = _with_room(vector, far_end, MAX_FAR)
+            if not counted:
+                far = _with_room(far, far_end, MAX_FAR)
+                vector = _with_room(vector, far_end, MAX_FAR)
             for i in range(colleague_start[parent[b]], colleague_start[parent[b] + 1]):
                 s = colleague[i]
                 if leaf[s]:
                     continue
                 opened[s] = True
+                x = cell[b, 0] - 2 * cell[s, 0]
+                y = cell[b, 1] - 2 * cell[s, 1]
+                z = cell[b, 2] - 2 * cell[s, 2]
                 for octant in range(8):
                     c = children[s, octant]
                     if c < 0 or source_count[c] == 0:
                         continue
-                    if _touch_same_level(cell, b, c) and not (smooth and (leaf[b] or leaf[c])):
+                    dx, dy, dz = x - (octant & 1), y - (octant >> 1 & 1), z - (octant >> 2)
+                    touch = (abs(dx) <= 1) & (abs(dy) <= 1) & (abs(dz) <= 1)
+                    if touch and not (smooth and (leaf[b] or leaf[c])):
                         colleague[near_end] = c
                         near_end += 1
                     else:
-                        far[far_end], vector[far_end] = c, _vector(cell, b, c)
+                        if not counted:
+                            far[far_end], vector[far_end] = c, _vector(dx, dy, dz)
                         far_end += 1
         colleague_start[b + 1], far_start[b + 1] = near_end, far_end
+    stored = 0 if counted else far_end
     return (
         colleague_start,
         colleague[:near_end].copy(),
         far_start,
-        far[:far_end].copy(),
-        vector[:far_end].copy(),
+        far[:stored].copy(),
+        vector[:stored].copy(),
     )
 
 
@@ -149,7 +159,13 @@ def leaf_rows(
             near[near_end] = coarse[i]
             near_end += 1
         for i in range(colleague_start[b], colleague_start[b + 1]):
-            stack[0] = colleague[i]
+            s = colleague[i]
+            if leaf[s]:
+                near = _with_room(near, near_end, 1)
+                near[near_end] = s
+                near_end += 1
+                continue
+            stack[0] = s
             waiting = 1
             while waiting > 0:
                 waiting -= 1
@@ -214,14 +230,6 @@ def merged_ranges(row, start, entry, ranges):
 
 
 @jit
-def _touch_same_level(cell, a, b):
-    x = abs(cell[a, 0] - cell[b, 0])
-    y = abs(cell[a, 1] - cell[b, 1])
-    z = abs(cell[a, 2] - cell[b, 2])
-    return max(x, y, z) <= 1
-
-
-@jit
 def _touch(level, cell, fine, coarse):
     """Whether a box touches, or lies in, one of the same or a coarser level."""
     shift = level[fine] - level[coarse]
@@ -234,12 +242,9 @@ def _touch(level, cell, fine, coarse):
 
 
 @jit
-def _vector(cell, target, source):
+def _vector(x, y, z):
     """Number of the transfer vector, lattice coordinates of the target less the source's."""
-    x = cell[target, 0] - cell[source, 0] + 3
-    y = cell[target, 1] - cell[source, 1] + 3
-    z = cell[target, 2] - cell[source, 2] + 3
-    return (x * 7 + y) * 7 + z
+    return ((x + 3) * 7 + y + 3) * 7 + z + 3
 
 
 @jit

@@ -358,12 +358,13 @@ class Cost:
         else:
             self.transfer = ns["matrix"] * nodes**4 * entries
 
-    def of(self, boxes: Boxes, direct_below: int, stride: int) -> tuple[float, float]:
-        """Nanoseconds (near, far) with the tree of the points, one in `stride` of them in `boxes`.
+    def of(self, boxes: Boxes, direct_below: int, stride: int) -> float:
+        """Nanoseconds with the tree of the points of which every stride-th is in `boxes`."""
+        return sum(self.parts(boxes, direct_below, stride))
 
-        far: of all that is done box by box.
-        """
-        lists = interaction_lists(boxes, direct_below=direct_below)
+    def parts(self, boxes: Boxes, direct_below: int, stride: int) -> tuple[float, float]:
+        """The same for what is done point by point, and for what is done box by box."""
+        lists = interaction_lists(boxes, direct_below=direct_below, far_counted=True)
         count = (boxes.target_count.astype(float), boxes.source_count.astype(float))
         nodes = self.nodes**3 / stride
         pairs = _point_pairs(lists.near, *count)
@@ -372,7 +373,7 @@ class Cost:
         parents = np.count_nonzero(~boxes.leaf)
         siblings = len(boxes) / max(parents, 1)
         # families of siblings together, 27 products for 64 pairs of which 0.91 are far
-        work = min(1.6, 29.7 / siblings**2) * len(lists.far)
+        work = min(1.6, 29.7 / siblings**2) * lists.far.start[-1]
         points = 0.5 * (count[0][0] + count[1][0])
         return (
             self.near * pairs * stride**2 + self.points * points * stride,
@@ -387,7 +388,8 @@ class Cost:
 
 def _point_pairs(pairs: Pairs, of_target: NDArray, of_source: NDArray) -> float:
     """Sum over pairs of boxes of the product of their counts."""
-    return float(np.sum(of_target[pairs.target()] * of_source[pairs.source]))
+    sums = np.append(0.0, np.cumsum(of_source[pairs.source]))
+    return float(np.dot(of_target, np.diff(sums[pairs.start])))
 
 
 def _best_leaf(keys: list[NDArray], stride: int, cost: Cost, direct_below: int) -> int:
@@ -406,7 +408,7 @@ def _best_leaf(keys: list[NDArray], stride: int, cost: Cost, direct_below: int) 
             continue  # trees contain each other: it is the same
         if far * len(boxes) >= fastest * known:
             break
-        near, far = cost.of(boxes, direct_below // stride, stride)
+        near, far = cost.parts(boxes, direct_below // stride, stride)
         known = len(boxes)
         if near + far < fastest:
             best, fastest = leaf, near + far

@@ -90,6 +90,7 @@ def interaction_lists(
     admissibility: Literal["standard", "smooth"] = "standard",
     wanted: NDArray[np.bool_] | None = None,
     direct_below: int = 0,
+    far_counted: bool = False,
 ) -> Lists:
     """Lists of the `wanted` boxes (nb,), by default those that hold targets, and their ancestors.
 
@@ -99,6 +100,8 @@ def interaction_lists(
 
     Boxes of fewer points than `direct_below` get neither W (sources) nor X (targets): the pairs
     of leaves under them become near.
+
+    With `far_counted`, `far` has the start of its rows only: enough to know what a tree costs.
 
     A part of a tree gives the same rows as the whole if it holds every box whose parent, with the
     26 boxes about the parent, meets a wanted leaf, and all boxes under one held that has fewer
@@ -120,6 +123,7 @@ def interaction_lists(
         boxes.source_count,
         wanted,
         admissibility == "smooth",
+        far_counted,
         opened,
     )
     coarse_start, coarse, *source_to_local = _lists.coarser(
