@@ -33,6 +33,9 @@ from stokes.fmm.near_field import NearField
 from stokes.fmm.transfer import FourierTransfer
 from stokes.fmm.tree import Splitting
 
+# Right-hand sides that pass through the stages together: a multiple of the near field's four.
+_TOGETHER = 8
+
 
 @dataclass(frozen=True)
 class Scheme:
@@ -240,51 +243,50 @@ class TreeSum:
 
     def apply(self, weights: NDArray) -> NDArray:
         """Collective. Sums (m, n_out, r) of weights (n, n_in, r), in the caller's order."""
+        parts = [
+            self._apply_some(weights[:, :, first : first + _TOGETHER])
+            for first in range(0, max(weights.shape[2], 1), _TOGETHER)
+        ]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)
+
+    def _apply_some(self, weights: NDArray) -> NDArray:
+        """Some right-hand sides (n, n_in, r): upward, transfers, downward, near field.
+
+        All of them go through every stage together; moments are (nb, r components, nodes^3).
+        """
         stage = partial(self._timed, self.apply_seconds)
         columns = weights.shape[2]
         with stage("distribute"):
             w = self.points.scatter_weights(weights.transpose(0, 2, 1))
-        values = np.zeros((columns, self.kernel.n_out, self._x_targets.shape[1]))
-        for column in range(columns):
-            self._add_far(w[column], values[column])
-        with stage("near"):
-            targets, start, sources = self._near
-            one = columns == 1
-            self._points_on_points.add(
-                self._x_targets,
-                targets,
-                self._x_sources,
-                w[0] if one else w,
-                start,
-                sources,
-                values[0] if one else values,
-            )
-        with stage("distribute"):
-            return self.points.gather(self._factor * values).transpose(0, 2, 1)
-
-    def _add_far(self, w: NDArray, values: NDArray) -> None:
-        """Upward, transfers, downward for one right-hand side, all but the near field."""
-        stage = partial(self._timed, self.apply_seconds)
         with stage("upward"):
             multipoles = self._upward(w)
         with stage("exchange"):
             self.points.complete_multipoles(multipoles)
+        values = np.zeros((columns, self.kernel.n_out, self._x_targets.shape[1]))
         with stage("far"):
-            local = self._transfers(multipoles)
+            local = self._transfers(multipoles, columns)
         with stage("source_to_local"):
             self._add_points_on_grids(w, local)
         with stage("downward"):
             self._downward(local, values)
         with stage("multipole_to_target"):
             self._add_grids_on_points(multipoles, values)
+        with stage("near"):
+            targets, start, sources = self._near
+            self._points_on_points.add(
+                self._x_targets, targets, self._x_sources, w, start, sources, values
+            )
+        with stage("distribute"):
+            return self.points.gather(self._factor * values).transpose(0, 2, 1)
 
     def _upward(self, w: NDArray) -> NDArray:
-        """P2M at this rank's leaves, M2M to the root: multipoles (nb, n_in, nodes^3)."""
-        multipoles = self._interpolator.empty_moments(self.boxes, self._far.n_in)
+        """P2M at this rank's leaves, M2M to the root: multipoles (nb, r n_in, nodes^3)."""
+        columns = len(w)
+        multipoles = self._interpolator.empty_moments(self.boxes, columns * self._far.n_in)
         self._interpolator.upward(
             self.points.upward,
             self._x_sources,
-            w,
+            w.reshape(columns * w.shape[1], w.shape[2]),
             multipoles,
             self._root_edge,
             own=self.points.has_sources,
@@ -292,11 +294,18 @@ class TreeSum:
         )
         return multipoles
 
-    def _transfers(self, multipoles: NDArray) -> NDArray:
-        """M2L on every level: locals (nb, n_out, nodes^3)."""
-        local = self._interpolator.empty_moments(self.boxes, self._far.n_out)
-        for pairs in self._far_pairs:
-            self.transfer.apply(pairs, multipoles, local)
+    def _transfers(self, multipoles: NDArray, columns: int) -> NDArray:
+        """M2L on every level: locals (nb, r n_out, nodes^3)."""
+        n_in, n_out = self._far.n_in, self._far.n_out
+        local = self._interpolator.empty_moments(self.boxes, columns * n_out)
+        for c in range(columns):
+            own = local[:, c * n_out : (c + 1) * n_out]
+            moments = np.ascontiguousarray(multipoles[:, c * n_in : (c + 1) * n_in])
+            sums = own if columns == 1 else np.zeros_like(own, order="C")
+            for pairs in self._far_pairs:
+                self.transfer.apply(pairs, moments, sums)
+            if columns > 1:
+                own[:] = sums
         return local
 
     def _downward(self, local: NDArray, values: NDArray) -> None:
@@ -305,7 +314,7 @@ class TreeSum:
             self.boxes,
             self._x_targets,
             local,
-            values,
+            values.reshape(len(values) * values.shape[1], values.shape[2]),
             self._root_edge,
             own=self.points.has_targets,
             gradient=self._gradient == "target",
@@ -313,21 +322,22 @@ class TreeSum:
 
     def _add_points_on_grids(self, w: NDArray, local: NDArray) -> None:
         """X: sources of larger leaves to the nodes of smaller boxes."""
-        if len(self._x_boxes) == 0:
+        boxes, size = len(self._x_boxes), self.grid.nodes**3
+        if boxes == 0:
             return
-        size = self.grid.nodes**3
         start, sources = self._x_ranges
-        targets = _ranges(np.arange(len(self._x_boxes)), size)
-        out = np.zeros((self._far.n_out, len(self._x_boxes) * size))
+        targets = _ranges(np.arange(boxes), size)
+        out = np.zeros((len(w), self._far.n_out, boxes * size))
         self._points_on_grids.add(self._x_nodes, targets, self._x_sources, w, start, sources, out)
-        local[self._x_boxes] += out.reshape(self._far.n_out, -1, size).swapaxes(0, 1)
+        local[self._x_boxes] += out.reshape(local.shape[1], boxes, size).swapaxes(0, 1)
 
     def _add_grids_on_points(self, multipoles: NDArray, values: NDArray) -> None:
         """W: nodes of smaller boxes to the targets of larger leaves."""
         if len(self._w_boxes) == 0:
             return
         targets, start, sources = self._w_ranges
-        w = multipoles[self._w_boxes].swapaxes(0, 1).reshape(self._far.n_in, -1)
+        shape = (len(values), self._far.n_in, self._w_nodes.shape[1])
+        w = multipoles[self._w_boxes].swapaxes(0, 1).reshape(shape)
         w = np.ascontiguousarray(w, dtype=np.float64)
         self._grids_on_points.add(
             self._x_targets, targets, self._w_nodes, w, start, sources, values
