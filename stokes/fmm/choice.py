@@ -358,12 +358,11 @@ class Cost:
         else:
             self.transfer = ns["matrix"] * nodes**4 * entries
 
-    def of(self, boxes: Boxes, direct_below: int, stride: int) -> float:
-        """Nanoseconds with the tree of the points of which every stride-th is in `boxes`."""
-        return sum(self.parts(boxes, direct_below, stride))
+    def of(self, boxes: Boxes, direct_below: int, stride: int) -> tuple[float, float]:
+        """Nanoseconds with the tree of the points of which every stride-th is in `boxes`.
 
-    def parts(self, boxes: Boxes, direct_below: int, stride: int) -> tuple[float, float]:
-        """The same for what is done point by point, and for what is done box by box."""
+        The first are of what is done point by point, the second of what is done box by box.
+        """
         lists = interaction_lists(boxes, direct_below=direct_below, far_counted=True)
         count = (boxes.target_count.astype(float), boxes.source_count.astype(float))
         nodes = self.nodes**3 / stride
@@ -408,7 +407,7 @@ def _best_leaf(keys: list[NDArray], stride: int, cost: Cost, direct_below: int) 
             continue  # trees contain each other: it is the same
         if far * len(boxes) >= fastest * known:
             break
-        near, far = cost.parts(boxes, direct_below // stride, stride)
+        near, far = cost.of(boxes, direct_below // stride, stride)
         known = len(boxes)
         if near + far < fastest:
             best, fastest = leaf, near + far
