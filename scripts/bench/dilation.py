@@ -41,7 +41,7 @@ NARROW = (
     "bodies.0.placement.jittered_grid.max=[0.08,0.08,0.4]",
     "time.end=0.4",
 )
-TOLERANCES = ((1e-3, 1e-2), (1e-4, 1e-4))  # m/s, and of complementarity
+TOLERANCES = ((1e-3, 1e-2), (1e-4, 1e-2), (1e-4, 1e-4))  # m/s, and of complementarity
 
 
 def sphere_records() -> list[Record]:
