@@ -25,7 +25,7 @@ from stokes.fmm.accuracy import operator_eps, sample_scheme, sum_error
 from stokes.fmm.chebyshev import is_symmetric
 from stokes.fmm.kernels import KERNELS, Kernel
 from stokes.fmm.lists import Pairs, interaction_lists
-from stokes.fmm.options import FmmOptions
+from stokes.fmm.options import FmmOptions, Near
 from stokes.fmm.tree import Boxes, Splitting, build, cube_about
 from stokes.fmm.tree_sum import Scheme
 
@@ -38,6 +38,8 @@ _BEYOND_TABLE = 4
 # Sums without near field: most points that are summed sooner than samples are taken, deepest
 # tree, largest leaf in kernel lengths.
 _WORTH_SAMPLES, _SMOOTH_DEPTHS, _SMOOTH_EDGE = 50_000, 5, 2.0
+# Near matrices take memory and time to be made: how much faster than computing reading must be.
+_WORTH_STORING = 1.3
 # Edges of clouds, in kernel lengths, for which errors of kernels with a length are measured.
 SAMPLE_EDGES = (0.5, 4.0, 32.0)
 # Keys on which leaf sizes are compared; of more points a part is drawn by its keys.
@@ -105,8 +107,21 @@ def choose(
         derivative=far.derivative,
         direct_below=direct_below,
         operator_eps=operator_eps(far.nodes),
+        near=_near(kernel, far.single, options),
+        near_memory=options.near_memory,
     )
     return Choice(scheme, far.error, why)
+
+
+def _near(kernel: Kernel, single: bool, options: FmmOptions) -> Near:
+    """What is asked of near matrices; "auto" only where an application is faster with them."""
+    if options.near != "auto":
+        return options.near
+    ns = constants()["nanoseconds"]["single" if single else "double"]
+    if not _is_built_in(kernel) or kernel.name not in ns["near"]:
+        return "recomputed"
+    read = ns["stored"] * kernel.n_in * kernel.n_out
+    return "auto" if ns["near"][kernel.name] > _WORTH_STORING * read else "recomputed"
 
 
 # ---- kernels smooth at the origin ---------------------------------------------------------------
@@ -243,7 +258,9 @@ class Errors:
         if single:
             return float(np.hypot(self(nodes), self._round_off))
         if self._known:
-            return max(_interpolated(row, nodes) for row in self._rows)
+            # differentiated polynomials meet round-off sooner: no errors but the measured ones
+            beyond = 0 if self.derivative == "interpolated" else _BEYOND_TABLE
+            return max(_interpolated(row, nodes, beyond) for row in self._rows)
         return self._measured(nodes, False)
 
     @functools.cached_property
@@ -282,8 +299,8 @@ def _is_built_in(kernel: Kernel) -> bool:
     return known is not None and known.apply is kernel.apply
 
 
-def _interpolated(table: dict[int, float], nodes: int) -> float:
-    """log-linear between the nodes of the table; a few beyond its end, as it falls there.
+def _interpolated(table: dict[int, float], nodes: int, beyond: int) -> float:
+    """log-linear between the nodes of the table; up to `beyond` after its end, as it falls there.
 
     Not below 3e-11: what round-off leaves of sums on grids of so many nodes.
     """
@@ -292,7 +309,7 @@ def _interpolated(table: dict[int, float], nodes: int) -> float:
     if nodes <= known[-1]:
         return float(np.exp(np.interp(nodes, known, logs)))
     slope = (logs[-1] - logs[-2]) / (known[-1] - known[-2])
-    further = min(nodes - known[-1], _BEYOND_TABLE)
+    further = min(nodes - known[-1], beyond)
     return max(float(np.exp(logs[-1] + min(slope, 0.0) * further)), 3e-11)
 
 
