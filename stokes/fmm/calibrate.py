@@ -22,6 +22,7 @@ from stokes.fmm.accuracy import cloud, sample_scheme, sum_error
 from stokes.fmm.choice import SAMPLE_EDGES, row_name
 from stokes.fmm.kernels import KERNELS, Kernel, laplace, stokeslet
 from stokes.fmm.near_field import NearField
+from stokes.fmm.near_matrices import NearMatrices
 from stokes.fmm.tree import Splitting
 from stokes.fmm.tree_sum import Scheme, TreeSum
 
@@ -107,6 +108,7 @@ def nanoseconds(*, single: bool) -> dict[str, Any]:
     entries = np.array([k.n_in * k.n_out for k in KERNELS.values()])
     return {
         "near": near,
+        "stored": _stored_entry(single),
         "near_entry": round(float(np.median(np.array(list(near.values())) / entries)), 3),
         **_far_field(single),
     }
@@ -124,6 +126,20 @@ def _near_pair(kernel: Kernel, single: bool) -> float:
     near = NearField(kernel, single)
     seconds = _fastest(lambda: near.add(x, ranges, x, w, start, everything, out))
     return round(1e9 * seconds / count**2, 3)
+
+
+def _stored_entry(single: bool) -> float:
+    """Of an entry of stored near matrices, more of them than caches hold."""
+    count, group, listed = 16384, 64, 32
+    x = np.ascontiguousarray(cloud("cube", count, 1).T)
+    first = np.arange(0, count, group)
+    ranges = np.stack((first, first + group), axis=1)
+    sources = ranges[np.arange(len(ranges) * listed) % len(ranges)]
+    start = listed * np.arange(len(ranges) + 1)
+    near = NearMatrices(laplace, x, ranges, x, start, sources, single=single)
+    w, out = np.ones((1, 1, count)), np.zeros((1, 1, count))
+    seconds = _fastest(lambda: near.add(w, out))
+    return round(1e9 * seconds / (count * listed * group), 3)
 
 
 def _far_field(single: bool) -> dict[str, float]:

@@ -186,6 +186,7 @@ class Fmm:
             precision="single" if scheme.single else "double",
             derivative=scheme.derivative,
             admissibility=scheme.admissibility,
+            near="recomputed" if plan.near_matrices is None else "cached",
             leaf_size=scheme.splitting.leaf_size,
             depth=plan.boxes.depth,
             boxes=len(plan.boxes),

@@ -10,6 +10,7 @@ Method = Literal["auto", "ufmm", "bbfmm", "symmetric"]
 Precision = Literal["auto", "double", "single"]
 Derivative = Literal["auto", "exact", "interpolated"]
 Admissibility = Literal["auto", "standard", "smooth"]
+Near = Literal["auto", "cached", "recomputed"]
 Backend = Literal["own", "fmm3d", "direct"]
 
 
@@ -29,6 +30,11 @@ class FmmOptions:
     admissibility : "smooth" transfers between touching leaves too, and has no near field: for
                     kernels smooth at the origin, in boxes not much larger than their length.
                     "auto" takes it for such kernels where the cost model finds it cheaper
+    near          : "cached" stores the near field's matrices, "recomputed" does not; "auto" stores
+                    them for kernels of the package that take longer to compute than to read, if
+                    they fit. Neither changes results by more than round-off
+    near_memory   : most bytes of such matrices on a rank; where one rank has more, "auto" stores
+                    none on any, and "cached" is an error
     threads       : of this rank
     """
 
@@ -39,6 +45,8 @@ class FmmOptions:
     precision: Precision = "auto"
     derivative: Derivative = "auto"
     admissibility: Admissibility = "auto"
+    near: Near = "auto"
+    near_memory: float = 2e9
     backend: Backend = "own"
     threads: int = 1
 
@@ -51,7 +59,8 @@ class FmmOptions:
             named = bool(allowed) and all(isinstance(choice, str) for choice in allowed)
             if named and value not in allowed:
                 raise ValueError(f"{item.name} = {value!r}: must be one of {allowed}")
-        for name, least in (("order", 1), ("leaf_size", 1), ("depth", 0), ("threads", 1)):
+        least_values = {"order": 1, "leaf_size": 1, "depth": 0, "near_memory": 0, "threads": 1}
+        for name, least in least_values.items():
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name} = {value}: must be >= {least}")
@@ -90,6 +99,7 @@ class FmmReport:
     precision: str = "double"
     derivative: str = "exact"
     admissibility: str = "standard"
+    near: str = "recomputed"
     leaf_size: int | None = None
     depth: int = 0
     boxes: int = 0

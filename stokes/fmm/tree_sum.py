@@ -30,6 +30,8 @@ from stokes.fmm.interpolation import Grid, Interpolator
 from stokes.fmm.kernels import Kernel
 from stokes.fmm.lists import point_ranges
 from stokes.fmm.near_field import NearField
+from stokes.fmm.near_matrices import NearMatrices, stored_bytes
+from stokes.fmm.options import Near
 from stokes.fmm.transfer import FourierTransfer
 from stokes.fmm.tree import Splitting
 
@@ -47,6 +49,8 @@ class Scheme:
     direct_below : points of a box below which neither its multipole nor its local is used by
                    leaves of other levels
     operator_eps : of the operators of low rank
+    near         : "cached", "recomputed", or "auto": cached if the matrices fit
+    near_memory  : bytes of the near field's matrices that fit on a rank
     """
 
     method: str
@@ -57,6 +61,8 @@ class Scheme:
     admissibility: str = "standard"
     direct_below: int = 0
     operator_eps: float = 1e-9
+    near: Near = "recomputed"
+    near_memory: float = 2e9
 
 
 def grid_of(method: str, nodes: int) -> Grid:
@@ -185,6 +191,7 @@ class TreeSum:
         self._grids_on_points = NearField(at_targets, single, threads)
         self._points_on_grids = NearField(at_sources, single, threads)
         self._near = point_ranges(boxes, lists.near)
+        self.near_matrices = self._stored_near(threads)
         # the boxes whose nodes stand for points
         self._w_boxes = np.unique(lists.multipole_to_target.source)
         self._w_nodes = self._nodes_of(self._w_boxes)
@@ -192,6 +199,29 @@ class TreeSum:
         self._x_boxes = lists.source_to_local.rows()
         self._x_nodes = self._nodes_of(self._x_boxes)
         self._x_ranges = point_ranges(boxes, lists.source_to_local)[1:]
+
+    def _stored_near(self, threads: int) -> NearMatrices | None:
+        """Collective. The matrices of the near field, where they are wanted and fit."""
+        scheme = self.scheme
+        if scheme.near == "recomputed":
+            return None
+        targets, start, sources = self._near
+        needed = stored_bytes(self._inner, scheme.single, targets, start, sources)
+        largest = self.points.parallel.max(needed)
+        if largest > scheme.near_memory:
+            if scheme.near == "auto":
+                return None
+            raise ValueError(
+                f"near = 'cached': the near field's matrices take {largest:.3g} bytes on a rank, "
+                f"more than near_memory = {scheme.near_memory:.3g}: raise it, take near = "
+                "'recomputed', a smaller leaf_size, or more ranks"
+            )
+        return NearMatrices(
+            self._inner,
+            *(self._x_targets, targets, self._x_sources, start, sources),
+            single=scheme.single,
+            threads=threads,
+        )
 
     def _nodes_of(self, number: NDArray) -> NDArray:
         """Grid nodes (3, k nodes^3) of k boxes, in internal coordinates."""
@@ -238,6 +268,7 @@ class TreeSum:
                 )
             ),
             "tables": int(self.transfer.bytes),
+            "near": 0 if self.near_matrices is None else self.near_matrices.nbytes,
             "expansions": moment * len(self.boxes) * (self._far.n_in + self._far.n_out),
         }
 
@@ -272,12 +303,19 @@ class TreeSum:
         with stage("multipole_to_target"):
             self._add_grids_on_points(multipoles, values)
         with stage("near"):
-            targets, start, sources = self._near
-            self._points_on_points.add(
-                self._x_targets, targets, self._x_sources, w, start, sources, values
-            )
+            self._add_near(w, values)
         with stage("distribute"):
             return self.points.gather(self._factor * values).transpose(0, 2, 1)
+
+    def _add_near(self, w: NDArray, values: NDArray) -> None:
+        """U: sources of touching leaves to targets."""
+        if self.near_matrices is not None:
+            self.near_matrices.add(w, values)
+            return
+        targets, start, sources = self._near
+        self._points_on_points.add(
+            self._x_targets, targets, self._x_sources, w, start, sources, values
+        )
 
     def _upward(self, w: NDArray) -> NDArray:
         """P2M at this rank's leaves, M2M to the root: multipoles (nb, r n_in, nodes^3)."""
