@@ -40,6 +40,10 @@ def page(name: str) -> str:
     return (ROOT / "docs" / name).read_text()
 
 
+def python_examples(text: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+
+
 def keys_of_table(text: str, heading: str) -> set[str]:
     """The names in the first column of the first table behind a heading."""
     table = text.split(f"## {heading}\n")[1].split("\n\n## ")[0]
@@ -108,10 +112,64 @@ def test_scene_in_the_readme_is_the_shipped_one():
 
 
 def test_h5py_example_of_the_readme_reads_the_last_frame(directory):
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    example = python_examples((ROOT / "README.md").read_text())[0]
     example = example.replace("runs/quick/run.h5", "run.h5")
     done = subprocess.run(
         [sys.executable, "-c", example], cwd=directory, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("0.003 [[")
+
+
+# ---- fast sums: fewer points than in the examples, to be quick ----------------------------------
+
+FEWER = {"100_000": "5_000", "50_000": "2_000", "20_000": "3_000"}
+
+
+def run_fast_sum(example: str, path, ranks: int = 1) -> str:
+    """What an example of a fast sum prints, run from a file: a kernel's loops know it by that."""
+    for many, few in FEWER.items():
+        example = example.replace(many, few)
+    (path / "example.py").write_text(example)
+    done = run_ranks(ranks, [path / "example.py"], timeout=240)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def printed_error(text: str) -> float:
+    return float(re.search(r"error (\S+)", text)[1])
+
+
+@pytest.mark.parametrize(
+    ("number", "ranks", "eps"),
+    [(0, 1, 1e-6), (1, 2, 1e-3), (2, 1, 1e-4)],
+    ids=["stokeslet", "two ranks", "own kernel"],
+)
+def test_examples_of_fast_sums_reach_the_asked_error(number, ranks, eps, tmp_path):
+    example = python_examples(page("fmm.md"))[number]
+    assert f"eps={eps:.0e}".replace("e-0", "e-") in example
+    assert printed_error(run_fast_sum(example, tmp_path, ranks)) <= eps
+
+
+def test_fast_sum_of_the_readme_reaches_the_asked_error(tmp_path):
+    example = python_examples((ROOT / "README.md").read_text())[1]
+    assert "eps=1e-6" in example
+    assert printed_error(run_fast_sum(example, tmp_path)) <= 1e-6
+
+
+def test_every_kernel_of_the_fast_sums_is_in_the_table():
+    from stokes.fmm import KERNELS
+
+    text = page("fmm.md").split("### A kernel of your own")[0]
+    rows = re.findall(r"^\| `(\w+)` \|.*\| (\d+) → (\d+) \| (\d+) \| (\S+) \|$", text, re.MULTILINE)
+    table = {name: row for name, *row in rows}
+    for name, k in KERNELS.items():
+        degree = "–" if k.degree is None else f"−{-k.degree:.0f}"
+        assert table.pop(name) == [str(k.n_in), str(k.n_out), str(k.n_unique), degree]
+    assert not table
+
+
+def test_every_option_of_the_fast_sums_is_explained():
+    from stokes.fmm import FmmOptions
+
+    assert keys_of_table(page("fmm.md"), "Options") >= {field.name for field in fields(FmmOptions)}
