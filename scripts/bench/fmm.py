@@ -379,25 +379,73 @@ def _draw_smooth(axis: Any, found: list[Record]) -> None:
 
 
 def table(records: list[Record]) -> str:
-    """The comparison as Markdown."""
+    """The comparison, growth with the points and the machine's limits, as Markdown."""
     lines = [
         f"`scripts/bench/fmm.py` at {commit()}.",
         "",
         "| kernel | points | error | ours (plan) [s] | FMM3D [s] | FMM3D / ours | direct [s] |",
         "|---|---|---|---|---|---|---|",
+        *(_compared_row(r) for r in records if _compared(r)),
+        *_growth_lines([r for r in records if r.name == "fmm.growth"]),
+        *_limit_lines([r for r in records if r.name.startswith("fmm.limits.")]),
     ]
-    for r in records:
-        if not _compared(r):
-            continue
-        p = r.params
-        told = f"{r.rival_value:.3g} | {1.0 / r.ratio:.2g}" if r.ratio else "- | -"
-        cores = "" if r.ranks == 1 else f", {r.ranks} ranks (threads)"
-        mark = "" if p["reached"] else " (not as exact)"
-        lines.append(
-            f"| {p['kernel']} | {p['n']:,} {p['distribution']}{cores} | {r.error:.0e}{mark} | "
-            f"{r.value:.3g} ({p['plan_seconds']:.2g}) | {told} | {p['direct_seconds']:.3g} |"
-        )
     return "\n".join(lines)
+
+
+def _compared_row(r: Record) -> str:
+    p = r.params
+    told = f"{r.rival_value:.3g} | {1.0 / r.ratio:.2g}" if r.ratio else "- | -"
+    cores = "" if r.ranks == 1 else f", {r.ranks} ranks (threads)"
+    mark = "" if p["reached"] else " (not as exact)"
+    return (
+        f"| {p['kernel']} | {p['n']:,} {p['distribution']}{cores} | {r.error:.0e}{mark} | "
+        f"{r.value:.3g} ({p['plan_seconds']:.2g}) | {told} | {p['direct_seconds']:.3g} |"
+    )
+
+
+def _growth_lines(found: list[Record]) -> list[str]:
+    if not found:
+        return []
+    told = (f"{r.params['of'].removeprefix('fmm.')} {r.params['distribution']} {r.value:.2f}"
+            for r in found)  # fmt: skip
+    return ["", f"Seconds grow with the points to the power of: {', '.join(told)}."]
+
+
+def _limit_lines(found: list[Record]) -> list[str]:
+    """Rows of flop/s and ns a pair; of transfers loads as well."""
+    by_loop: dict[tuple[str, ...], dict[str, Record]] = {}
+    for r in found:
+        kind, *name = r.name.removeprefix("fmm.limits.").split(".")
+        if kind in ("near", "transfer"):
+            nodes = f", {r.params['nodes']} nodes" if "nodes" in r.params else ""
+            loop = (f"{kind}, {name[0]}{nodes}", r.params["precision"])
+            by_loop.setdefault(loop, {})[name[1] if name[1:] else "flops"] = r
+    if not by_loop:
+        return []
+    lines = [
+        "",
+        "| loop, on one core | precision | ns a pair | GFlop/s (of the peak) | loads in GB/s |",
+        "|---|---|---|---|---|",
+    ]
+    for (loop, precision), rates in by_loop.items():
+        flops, loads = rates["flops"], rates.get("loads")
+        lines.append(
+            f"| {loop} | {precision} | {flops.params['ns_of_a_pair']:.3g} | {flops.value:.3g} "
+            f"({flops.params['fraction']:.0%}) | {f'{loads.value:.3g}' if loads else ''} |"
+        )
+    rates = {r.name.removeprefix("fmm.limits."): r for r in found}
+    peak, product = (
+        [rates[f"{name}.{kind}"].value for kind in ("double", "single")]
+        for name in ("peak", "matrix_product")
+    )
+    return [
+        *lines,
+        "",
+        f"The peak, products added in registers, is {peak[0]:.0f} GFlop/s in double and "
+        f"{peak[1]:.0f} in single precision; numpy's matrix product reaches {product[0]:.0f} and "
+        f"{product[1]:.0f}; STREAM's triad {rates['triad'].value:.0f} GB/s. Loads beyond that "
+        "come from the caches.",
+    ]
 
 
 def put(text: str, page: Path) -> None:
@@ -428,6 +476,8 @@ def main() -> None:
     if options.figure:
         draw(records, options.figure)
     if options.page:
+        if not any(_compared(r) for r in records):
+            raise SystemExit("--page: nothing compared; take the part `rival`")
         put(table(records), options.page)
 
 
