@@ -320,10 +320,8 @@ def _root_cube(parallel: Parallel, point_sets: list[NDArray]) -> tuple[NDArray[n
     """
     outermost = np.full(6, -np.inf)
     for points in point_sets:
-        for sign, part in ((-1.0, slice(0, 3)), (1.0, slice(3, 6))):
-            outermost[part] = np.maximum(
-                outermost[part], np.max(sign * points, axis=0, initial=-np.inf)
-            )
+        low, high = tree.corners(points)
+        outermost = np.maximum(outermost, np.concatenate((-low, high)))
     outermost[np.isnan(outermost)] = np.inf  # MPI leaves the maximum with a NaN open
     outermost = parallel.max(outermost)
     if np.all(outermost == -np.inf):

@@ -135,9 +135,18 @@ def root_cube(*point_sets: ArrayLike) -> tuple[NDArray[np.float64], float]:
     points = [p for p in points if len(p)]
     if not points:
         return np.zeros(3), 1.0
-    low = np.min([p.min(axis=0) for p in points], axis=0)
-    high = np.max([p.max(axis=0) for p in points], axis=0)
-    return cube_about(low, high)
+    low, high = zip(*(corners(p) for p in points), strict=True)
+    return cube_about(np.min(low, axis=0), np.max(high, axis=0))
+
+
+def corners(points: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lowest and highest coordinates, (3,) each, of points (n, 3); inf and -inf if there are none.
+
+    NaN where a coordinate is. (Along the short axis numpy takes ten times as long.)
+    """
+    low = np.array([points[:, axis].min(initial=np.inf) for axis in range(3)])
+    high = np.array([points[:, axis].max(initial=-np.inf) for axis in range(3)])
+    return low, high
 
 
 def cube_about(low: ArrayLike, high: ArrayLike) -> tuple[NDArray[np.float64], float]:
