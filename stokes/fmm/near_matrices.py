@@ -157,11 +157,12 @@ def _fill_loop(
                 for d in range(3):
                     for j in range(count):
                         tile[d, j] = (gathered[0, d * width + j] - centre[d]) * scale
+                size = n_out * (last - first) * n_in * columns
+                block = entries[base : base + size].reshape((n_out, last - first, n_in, columns))
                 _evaluate(
-                    *(apply, zero_in, unit, targets, first, last, centre, scale),
-                    *(tile, count, columns, n_out, entries[base:]),
+                    *(apply, zero_in, unit, targets, first, centre, scale, tile, count, block)
                 )
-                base += (last - first) * n_out * n_in * columns
+                base += size
                 left -= count
 
     return fill
@@ -207,26 +208,22 @@ def _gather(rows, source_range, k, skip, count, stride, tile):
     return k, skip
 
 
-@register_jitable
-def _evaluate(
-    apply, zero_in, unit, targets, first, last, centre, scale, tile, count, columns, n_out, entries
-):
-    """The entries of one tile: targets [first, last) and `count` sources, zeros up to columns."""
-    n_in, rows = len(zero_in), last - first
+@register_jitable(fastmath=_REORDERED)
+def _evaluate(apply, zero_in, unit, targets, first, centre, scale, tile, count, block):
+    """The entries (n_out, rows, n_in, columns) of targets from `first` on and `count` sources."""
     real = tile.dtype.type
+    n_out, rows, n_in = block.shape[:3]
     for t in range(rows):
         x = real((targets[0, first + t] - centre[0]) * scale)
         y = real((targets[1, first + t] - centre[1]) * scale)
         z = real((targets[2, first + t] - centre[2]) * scale)
         for i in range(n_in):
             w = load_components(unit, i, zero_in)
-            for j in range(count):
-                k = apply(x - tile[0, j], y - tile[1, j], z - tile[2, j], w)
-                for o in range(n_out):
-                    entries[((o * rows + t) * n_in + i) * columns + j] = k[o]
             for o in range(n_out):
-                for j in range(count, columns):
-                    entries[((o * rows + t) * n_in + i) * columns + j] = 0.0
+                row = block[o, t, i]
+                for j in range(count):
+                    row[j] = apply(x - tile[0, j], y - tile[1, j], z - tile[2, j], w)[o]
+                row[count:] = real(0.0)
 
 
 @functools.cache
