@@ -26,8 +26,8 @@ from stokes.fmm.chebyshev import is_symmetric
 from stokes.fmm.kernels import KERNELS, Kernel
 from stokes.fmm.lists import Pairs, interaction_lists
 from stokes.fmm.options import FmmOptions, Near
-from stokes.fmm.tree import Boxes, Splitting, build, cube_about
-from stokes.fmm.tree_sum import Scheme
+from stokes.fmm.tree import Boxes, Splitting, build, corners, cube_about
+from stokes.fmm.tree_sum import Scheme, single_pairs
 
 # Errors are measured on small clouds: a plan aims at this fraction of the asked one.
 SAFETY = 0.6
@@ -362,7 +362,8 @@ class Cost:
     ) -> None:
         ns = constants()["nanoseconds"]["single" if single else "double"]
         moved = kernel.base if derivative == "interpolated" else kernel
-        near = ns["near"].get(kernel.name, ns["near_entry"] * kernel.n_in * kernel.n_out)
+        pairs = ns if single_pairs(kernel) else constants()["nanoseconds"]["double"]
+        near = pairs["near"].get(kernel.name, pairs["near_entry"] * kernel.n_in * kernel.n_out)
         entries, ends = moved.n_in * moved.n_out, moved.n_in + moved.n_out
         self.near = near
         self.nodes = nodes
@@ -457,7 +458,7 @@ def _cube(
     """Collective. The cube about all points."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for points in (sources, targets):
-        low = np.minimum(low, points.min(axis=0, initial=np.inf))
-        high = np.maximum(high, points.max(axis=0, initial=-np.inf))
+        lowest, highest = corners(points)
+        low, high = np.minimum(low, lowest), np.maximum(high, highest)
     low, high = parallel.min(low), parallel.max(high)
     return cube_about(low, high) if np.all(low <= high) else (np.zeros(3), 1.0)

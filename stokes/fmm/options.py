@@ -24,7 +24,7 @@ class FmmOptions:
     order         : p of the interpolation; a grid has p + 1 nodes a direction
     leaf_size     : most points of one kind (sources or targets) in a leaf
     depth         : a uniform tree instead: its leaves are the occupied boxes of this level
-    precision     : of the far field and, in single, of the near field's pairs
+    precision     : of the far field; single also of near pairs, of kernels up to 1/r
     derivative    : a kernel that is a gradient of another: "exact" transfers the gradient itself,
                     "interpolated" transfers the other kernel and differentiates the interpolation
     admissibility : "smooth" transfers between touching leaves too, and has no near field: for
