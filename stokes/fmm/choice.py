@@ -23,17 +23,20 @@ from dem_mpi import morton
 from dem_mpi.parallel import Parallel
 from stokes.fmm.accuracy import operator_eps, sample_scheme, sum_error
 from stokes.fmm.chebyshev import is_symmetric
+from stokes.fmm.close_pairs import close_distance
 from stokes.fmm.kernels import KERNELS, Kernel
 from stokes.fmm.lists import Pairs, interaction_lists
 from stokes.fmm.options import FmmOptions, Near
 from stokes.fmm.tree import Boxes, Splitting, build, corners, cube_about
-from stokes.fmm.tree_sum import Scheme, single_pairs
+from stokes.fmm.tree_sum import Scheme, grid_of, single_pairs
 
 # Errors are measured on small clouds: a plan aims at this fraction of the asked one.
-SAFETY = 0.6
+SAFETY = 0.8
 # Most nodes tried. Equispaced polynomials lose a digit to round-off every 3 nodes.
 MOST_NODES = {"ufmm": 18, "bbfmm": 20, "symmetric": 20}
 _LEAST_NODES = 3
+# Nodes with which the round-off of single precision is measured; it grows with more.
+ROUND_OFF_NODES = 7
 _BEYOND_TABLE = 4
 # Sums without near field: most points that are summed sooner than samples are taken, deepest
 # tree, largest leaf in kernel lengths.
@@ -107,6 +110,7 @@ def choose(
         derivative=far.derivative,
         direct_below=direct_below,
         operator_eps=operator_eps(far.nodes),
+        close=close_distance(eps),
         near=_near(kernel, far.single, options),
         near_memory=options.near_memory,
     )
@@ -256,7 +260,9 @@ class Errors:
     def __call__(self, nodes: int, single: bool = False) -> float:
         """Largest relative error measured with so many nodes."""
         if single:
-            return float(np.hypot(self(nodes), self._round_off))
+            gain = grid_of(self.method, nodes).noise_gain
+            gain /= grid_of(self.method, ROUND_OFF_NODES).noise_gain
+            return float(np.hypot(self(nodes), max(gain, 1.0) * self._round_off))
         if self._known:
             # differentiated polynomials meet round-off sooner: no errors but the measured ones
             beyond = 0 if self.derivative == "interpolated" else _BEYOND_TABLE
@@ -267,7 +273,7 @@ class Errors:
     def _round_off(self) -> float:
         """What single precision adds."""
         known = constants()["single"].get(self.kernel.name) if self._known else None
-        return known or max(self._measured(9, True), 1e-6)
+        return known or max(self._measured(ROUND_OFF_NODES, True), 1e-6)
 
     @functools.cache  # noqa: B019 (an object of a plan's own short life)
     def _measured(self, nodes: int, single: bool) -> float:
@@ -336,8 +342,9 @@ def _in_precision(far: _Far, errors: Errors, eps: float, options: FmmOptions) ->
     """The same in single precision, if that is asked for or good enough."""
     if options.precision == "double" or not errors.kernel.single:
         return far
-    # below this no kernel's single precision is enough: saves the measurement
-    if options.precision == "auto" and eps < 1e-6:
+    # below this no kernel's single precision is enough in all clouds: in clusters round-off of
+    # the far field grew to 6e-5 with 9 nodes
+    if options.precision == "auto" and eps < 1e-5:
         return far
     error = errors(far.nodes, single=True)
     if options.precision == "auto" and error > max(SAFETY * eps, 1.1 * far.error):
