@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from dem_mpi.parallel import Parallel
 from stokes.fmm.chebyshev import CompressedTransfer, SymmetricTransfer
+from stokes.fmm.close_pairs import ClosePairs
 from stokes.fmm.distribution import Distribution
 from stokes.fmm.interpolation import Grid, Interpolator
 from stokes.fmm.kernels import Kernel
@@ -49,6 +50,7 @@ class Scheme:
     direct_below : points of a box below which neither its multipole nor its local is used by
                    leaves of other levels
     operator_eps : of the operators of low rank
+    close        : pairs closer than this part of the extent of the target's leaf are in double
     near         : "cached", "recomputed", or "auto": cached if the matrices fit
     near_memory  : bytes of the near field's matrices that fit on a rank
     """
@@ -61,6 +63,7 @@ class Scheme:
     admissibility: str = "standard"
     direct_below: int = 0
     operator_eps: float = 1e-9
+    close: float = 0.0
     near: Near = "recomputed"
     near_memory: float = 2e9
 
@@ -213,6 +216,24 @@ class TreeSum:
         self._x_boxes = lists.source_to_local.rows()
         self._x_nodes = self._nodes_of(self._x_boxes)
         self._x_ranges = point_ranges(boxes, lists.source_to_local)[1:]
+        self._set_close(threads)
+
+    def _set_close(self, threads: int) -> None:
+        """The pairs too close for single precision, of points, and of points and nodes.
+
+        Nodes as targets have none: the groups are grids of small boxes, sources next to them are
+        as far as nodes are from each other.
+        """
+        find = partial(ClosePairs, distance=self.scheme.close, threads=threads)
+        self._close_points = self._close_nodes = None
+        x, y, near = self._x_targets, self._x_sources, self._points_on_points
+        targets, start, sources = self._near
+        if near.single and self.near_matrices is None:
+            self._close_points = find(near.kernel, x, targets, y, start, sources)
+        nodes, on_points = self._w_nodes, self._grids_on_points
+        targets, start, sources = self._w_ranges
+        if on_points.single and len(self._w_boxes):
+            self._close_nodes = find(on_points.kernel, x, targets, nodes, start, sources)
 
     def _stored_near(self, threads: int) -> NearMatrices | None:
         """Collective. The matrices of the near field, where they are wanted and fit."""
@@ -330,6 +351,8 @@ class TreeSum:
         self._points_on_points.add(
             self._x_targets, targets, self._x_sources, w, start, sources, values
         )
+        if self._close_points is not None:
+            self._close_points.correct(w, values)
 
     def _upward(self, w: NDArray) -> NDArray:
         """P2M at this rank's leaves, M2M to the root: multipoles (nb, r n_in, nodes^3)."""
@@ -394,6 +417,8 @@ class TreeSum:
         self._grids_on_points.add(
             self._x_targets, targets, self._w_nodes, w, start, sources, values
         )
+        if self._close_nodes is not None:
+            self._close_nodes.correct(w, values)
 
 
 def _inside(points: NDArray, origin: NDArray, unit: float) -> NDArray[np.float64]:
