@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 SEED = 20170626
 SAMPLES = 1000
+BUDGET = 40.0  # s, after which the rival's calls are not repeated
 
 
 def points(distribution: str, n: int) -> NDArray:
@@ -97,8 +98,8 @@ def _own(task: dict[str, Any]) -> dict[str, Any]:
     def plan() -> Fmm:
         return Fmm(kernel, x, eps=task["eps"], options=options, parallel=parallel)
 
-    plan().apply(w)  # compiles, or loads what is compiled
     before = _memory()
+    plan().apply(w)  # compiles, or loads what is compiled
     plans, applies = [], []
     for _ in range(task["plans"]):
         parallel.barrier()
@@ -148,6 +149,8 @@ def _fmm3d(task: dict[str, Any]) -> dict[str, Any]:
         began = perf_counter()
         values = apply(x, w, task["eps"])
         applies.append(perf_counter() - began)
+        if sum(applies) > BUDGET:
+            break
     # Its Stokeslet has another factor in each version: taken from a pair at unit distance.
     pair = np.asfortranarray([[0.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
     push = np.asfortranarray([[1.0, 0.0], [0.0, 0.0], [0.0, 0.0]]) if stokes else np.eye(1, 2)
