@@ -148,7 +148,7 @@ def _fill_loop(
                 _middle(targets[2], first, last),
             )
             unit = np.eye(n_in).astype(real)
-            gathered, tile = np.empty((1, 3 * width)), np.empty((3, width), real)
+            gathered, tile = np.empty((1, 3 * width)), np.empty((3, width))
             left = _listed(source_range, start[g], start[g + 1])
             k, skip, base = start[g], 0, offset[g]
             while left > 0:
@@ -211,19 +211,23 @@ def _gather(rows, source_range, k, skip, count, stride, tile):
 
 @register_jitable(fastmath=_REORDERED)
 def _evaluate(apply, zero_in, unit, targets, first, centre, scale, tile, count, block):
-    """The entries (n_out, rows, n_in, columns) of targets from `first` on and `count` sources."""
-    real = tile.dtype.type
+    """The entries (n_out, rows, n_in, columns) of targets from `first` on and `count` sources.
+
+    Differences are taken in double: the closest pairs keep their digits in single precision too.
+    """
+    real = block.dtype.type
     n_out, rows, n_in = block.shape[:3]
     for t in range(rows):
-        x = real((targets[0, first + t] - centre[0]) * scale)
-        y = real((targets[1, first + t] - centre[1]) * scale)
-        z = real((targets[2, first + t] - centre[2]) * scale)
+        x = (targets[0, first + t] - centre[0]) * scale
+        y = (targets[1, first + t] - centre[1]) * scale
+        z = (targets[2, first + t] - centre[2]) * scale
         for i in range(n_in):
             w = load_components(unit, i, zero_in)
             for o in range(n_out):
                 row = block[o, t, i]
                 for j in range(count):
-                    row[j] = apply(x - tile[0, j], y - tile[1, j], z - tile[2, j], w)[o]
+                    rx, ry, rz = real(x - tile[0, j]), real(y - tile[1, j]), real(z - tile[2, j])
+                    row[j] = apply(rx, ry, rz, w)[o]
                 row[count:] = real(0.0)
 
 
