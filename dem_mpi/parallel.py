@@ -13,6 +13,7 @@ import pickle
 import sys
 import time
 import traceback
+import weakref
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -56,8 +57,13 @@ class Parallel:
 
     @classmethod
     def alone(cls) -> Parallel:
-        """Return a group of this rank only."""
-        return cls(MPI.COMM_SELF)
+        """Return a group of this rank only, whose communicator ends with it.
+
+        MPI has some 65,000 communicators, and a plan of sums or a solver may make a group each.
+        """
+        group = cls(MPI.COMM_SELF)
+        weakref.finalize(group, _free_if_open, group.communicator)
+        return group
 
     def ranks_of_machine(self) -> int:
         """Collective. The number of these ranks that share this rank's memory."""
@@ -263,6 +269,11 @@ class Parallel:
             self.abort(getattr(value, "exit_code", exit_code))
 
         sys.excepthook = hook
+
+
+def _free_if_open(communicator: MPI.Comm) -> None:
+    if communicator != MPI.COMM_NULL and not MPI.Is_finalized():
+        communicator.Free()
 
 
 def _as_bytes(array: NDArray) -> NDArray:

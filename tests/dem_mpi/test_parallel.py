@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 
 import numpy as np
 import pytest
+
+from mpi4py import MPI
 
 import dem_mpi.parallel
 from dem_mpi.errors import DataError, InputError
@@ -148,6 +151,15 @@ def test_groups_of_the_same_ranks_do_not_take_each_others_messages(parallel):
             check_exchange(group, random_messages(parallel.size, seed, largest=50))
     for group in others:
         group.free()
+
+
+def test_communicator_of_a_group_of_one_ends_with_it():
+    group = Parallel.alone()
+    communicator = group.communicator
+    del group
+    gc.collect()
+    assert communicator == MPI.COMM_NULL
+    Parallel.alone().free()
 
 
 @ranks_1_2_3_8
