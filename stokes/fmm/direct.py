@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from dem_mpi.parallel import Parallel
+from stokes.fmm._requests import as_given, checked_points, columns_of, raised_together
 from stokes.fmm.kernels import Kernel
 from stokes.fmm.near_field import NearField
 
@@ -30,54 +31,19 @@ def direct_sum(
     sources (n, 3), targets (m, 3) or None for the sources themselves; weights (n, n_in),
     (n, n_in, r) for r right-hand sides, or (n,) if n_in = 1. Returns (m, n_out), (m, n_out, r),
     or (m,) if weights are (n,) and n_out = 1. A singular kernel counts 0 at coincident points.
+
+    Raises ValueError, on all ranks, for other shapes and points that are not finite.
     """
-    error = None
-    try:
-        x, y, w = _checked(kernel, sources, targets, weights)
-    except ValueError as wrong:
-        error = wrong
-    if parallel is not None:
-        parallel.raise_together(error)
-    elif error is not None:
-        raise error
+    with raised_together(parallel):
+        y = checked_points("sources", sources)
+        x = y if targets is None else checked_points("targets", targets)
+    w = columns_of(kernel, weights, len(y), parallel)
     out = np.zeros((w.shape[2], kernel.n_out, len(x)))
     near = NearField(kernel, threads=threads)
     groups = _groups(len(x))
     for block_y, block_w in _blocks(y, w, parallel):
         _add(near, np.ascontiguousarray(x.T), groups, block_y, block_w, out)
-    result = np.ascontiguousarray(out.transpose(2, 1, 0))
-    rank = np.ndim(weights)
-    if rank == 3:
-        return result
-    return result[:, 0, 0] if rank == 1 and kernel.n_out == 1 else result[:, :, 0]
-
-
-def _checked(
-    kernel: Kernel, sources: ArrayLike, targets: ArrayLike | None, weights: ArrayLike
-) -> tuple[NDArray, NDArray, NDArray]:
-    """Targets (m, 3), sources (n, 3) and weights (n, n_in, r)."""
-    y = _points("sources", sources)
-    x = y if targets is None else _points("targets", targets)
-    return x, y, _as_columns(kernel, np.asarray(weights, np.float64), len(y))
-
-
-def _points(name: str, points: ArrayLike) -> NDArray:
-    array = np.asarray(points, np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"direct sum: {name} has the shape {array.shape}, not (n, 3)")
-    return array
-
-
-def _as_columns(kernel: Kernel, weights: NDArray, n: int) -> NDArray:
-    """Weights as (n, n_in, r)."""
-    if weights.shape == (n,) and kernel.n_in == 1:
-        return weights[:, None, None]
-    if weights.shape[:2] == (n, kernel.n_in) and weights.ndim in (2, 3):
-        return weights if weights.ndim == 3 else weights[:, :, None]
-    raise ValueError(
-        f"direct sum: weights has the shape {weights.shape}, not {(n, kernel.n_in)} or "
-        f"{(n, kernel.n_in)} + (right-hand sides,)"
-    )
+    return as_given(kernel, weights, np.ascontiguousarray(out.transpose(2, 1, 0)))
 
 
 def _groups(m: int) -> NDArray:

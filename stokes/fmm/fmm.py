@@ -10,15 +10,20 @@ between boxes of one level, passes downward and adds the near field (`tree_sum`)
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
+from numbers import Real
 from types import MappingProxyType
 
 import numpy as np
 from numba.core import event
+from numba.core.errors import NumbaError
 from numpy.typing import ArrayLike, NDArray
 
 from dem_mpi.parallel import Parallel
+from stokes.fmm._requests import as_given, checked_points, columns_of, raised_together
 from stokes.fmm.backends import Direct, Fmm3d
 from stokes.fmm.choice import Choice, choose
 from stokes.fmm.direct import direct_sum
@@ -48,22 +53,22 @@ class Fmm:
                   A singular kernel leaves out the term of a source that coincides with the target
         eps     : ||u - u_direct||_2 / ||u_direct||_2 over all targets that is aimed at
 
-        Raises ValueError for points that are not finite or not (n, 3), eps outside (0, 1), and
-        options that exclude each other, on all ranks.
+        Raises ValueError for points that are not finite or not (n, 3), eps outside (0, 1),
+        options that exclude each other, and a kernel, eps or options that are not the same on all
+        ranks; on all ranks.
         """
         self.kernel = kernel
         self.options = options or FmmOptions()
         self.eps = eps
+        if not isinstance(parallel, Parallel | None):
+            raise TypeError("parallel: must be a dem_mpi.parallel.Parallel of a communicator")
         self._parallel = parallel or Parallel.alone()
         self._compile_seconds = 0.0
-        error = None
-        try:
-            self._sources = _checked_points("sources", sources)
-            self._targets = None if targets is None else _checked_points("targets", targets)
+        with raised_together(self._parallel), self._compiling():
+            self._sources = checked_points("sources", sources)
+            self._targets = None if targets is None else checked_points("targets", targets)
             _check_request(kernel, eps, self.options, self._parallel)
-        except ValueError as fault:
-            error = fault
-        self._parallel.raise_together(error)
+        _check_agreement(kernel, eps, self.options, self._parallel)
         with self._compiling():
             self._build()
 
@@ -98,32 +103,12 @@ class Fmm:
         weights: (n, n_in), (n, n_in, r) for r right-hand sides, or (n,) if n_in = 1. Returns
         (m, n_out), (m, n_out, r), or (m,) if weights are (n,) and n_out = 1.
 
-        Raises ValueError, on all ranks, for weights of another shape.
+        Raises ValueError, on all ranks, for weights of another shape or complex ones.
         """
-        given = np.asarray(weights, dtype=np.float64)
-        error = None
-        try:
-            columns = self._columns(given)
-        except ValueError as fault:
-            error = fault
-        self._parallel.raise_together(error)
+        columns = columns_of(self.kernel, weights, len(self._sources), self._parallel)
         with self._compiling():
             values = self._sum.apply(columns)
-        if given.ndim == 3:
-            return values
-        return values[:, 0, 0] if given.ndim == 1 and self.kernel.n_out == 1 else values[:, :, 0]
-
-    def _columns(self, weights: NDArray) -> NDArray:
-        """Weights as (n, n_in, r)."""
-        n, n_in = len(self._sources), self.kernel.n_in
-        if weights.ndim == 1 and n_in == 1 and len(weights) == n:
-            return weights[:, None, None]
-        if weights.ndim in (2, 3) and weights.shape[:2] == (n, n_in):
-            return weights if weights.ndim == 3 else weights[:, :, None]
-        raise ValueError(
-            f"weights of shape {weights.shape}: kernel {self.kernel.name} over {n} sources "
-            f"takes ({n}, {n_in}) or ({n}, {n_in}, r)"
-        )
+        return as_given(self.kernel, weights, values)
 
     def estimate_error(
         self, weights: ArrayLike, values: ArrayLike, samples: int = 1000, seed: int = _SAMPLE_SEED
@@ -132,11 +117,14 @@ class Fmm:
 
         Targets are drawn without repetition, in proportion to what each rank has; of all of them
         the estimate is the error itself. O(samples n).
+
+        Raises ValueError, on all ranks, for weights or values of another shape, or no samples.
         """
-        columns = self._columns(np.asarray(weights, dtype=np.float64))
-        given = np.asarray(values, dtype=np.float64).reshape(
-            len(self._points), self.kernel.n_out, columns.shape[2]
-        )
+        columns = columns_of(self.kernel, weights, len(self._sources), self._parallel)
+        with raised_together(self._parallel):
+            if samples < 1:
+                raise ValueError(f"samples = {samples}: must be >= 1")
+            given = self._as_applied(values, columns.shape[2])
         mine = self._sampled(samples, seed)
         exact = direct_sum(
             self.kernel,
@@ -159,11 +147,19 @@ class Fmm:
             samples=self._parallel.sum(len(mine)),
         )
 
+    def _as_applied(self, values: ArrayLike, r: int) -> NDArray[np.float64]:
+        """Values of `apply` as (m, n_out, r)."""
+        array, shape = np.asarray(values, dtype=np.float64), (len(self._points), self.kernel.n_out)
+        if array.shape not in ((*shape, r), shape, shape[:1]) or array.size != math.prod(shape) * r:
+            raise ValueError(f"values of shape {array.shape}: must be what `apply(weights)` gives")
+        return array.reshape(*shape, r)
+
     def _sampled(self, samples: int, seed: int) -> NDArray[np.int64]:
         """Targets of this rank that are in the sample."""
         own = len(self._points)
         total, before = self._parallel.sum(own), self._parallel.exclusive_sum(own)
-        drawn = np.random.default_rng(seed).permutation(total)[: min(samples, total)]
+        # unlike a permutation, `choice` of few needs no memory for all targets of all ranks
+        drawn = np.random.default_rng(seed).choice(total, min(samples, total), replace=False)
         return np.sort(drawn[(drawn >= before) & (drawn < before + own)]) - before
 
     @property
@@ -176,7 +172,9 @@ class Fmm:
         """What the plan is made of, on this rank."""
         common = {"kernel": self.kernel.name, "compile_seconds": self._compile_seconds}
         if self._choice is None:
-            return FmmReport(method=self.options.backend, expected_error=self.eps, **common)
+            direct = self.options.backend == "direct"
+            error = float(np.finfo(np.float64).eps) if direct else self.eps
+            return FmmReport(method=self.options.backend, expected_error=error, **common)
         scheme, plan = self._choice.scheme, self._sum
         return FmmReport(
             method=scheme.method,
@@ -226,18 +224,13 @@ def _ratio(part: float, whole: float) -> float:
     return 0.0 if part == 0.0 else np.inf
 
 
-def _checked_points(name: str, points: ArrayLike) -> NDArray[np.float64]:
-    array = np.ascontiguousarray(points, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise ValueError(f"{name} of shape {array.shape}: must be (n, 3)")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name}: coordinates must be finite")
-    return array
-
-
 def _check_request(kernel: Kernel, eps: float, options: FmmOptions, parallel: Parallel) -> None:
-    if not 0.0 < eps < 1.0:
-        raise ValueError(f"eps = {eps}: must be between 0 and 1")
+    if not isinstance(kernel, Kernel):
+        raise TypeError(f"kernel = {kernel!r}: must be a Kernel, such as KERNELS['stokeslet']")
+    if not isinstance(options, FmmOptions):
+        raise TypeError(f"options = {options!r}: must be FmmOptions")
+    if not (isinstance(eps, Real) and 0.0 < eps < 1.0):
+        raise ValueError(f"eps = {eps!r}: must be a number between 0 and 1")
     if options.derivative == "interpolated" and kernel.base is None:
         raise ValueError(f"kernel {kernel.name} is not a derivative: derivative must be 'exact'")
     if options.admissibility == "smooth" and not kernel.smooth:
@@ -246,3 +239,32 @@ def _check_request(kernel: Kernel, eps: float, options: FmmOptions, parallel: Pa
         raise ValueError(f"kernel {kernel.name} has no form in single precision")
     if options.backend == "fmm3d" and parallel.size > 1:
         raise ValueError("backend 'fmm3d' works on one rank only")
+    _check_function(kernel)
+
+
+def _check_function(kernel: Kernel) -> None:
+    """Raise ValueError for a kernel's function that does not compile, or not vanish at r = 0."""
+    try:
+        at_origin = kernel.matrix(np.zeros((1, 3)))
+    except NumbaError as fault:
+        raise ValueError(
+            f"kernel {kernel.name}: its function does not compile; it must be decorated with "
+            f"numba.extending.register_jitable, or: {fault}"
+        ) from fault
+    if not np.isfinite(at_origin).all():
+        raise ValueError(
+            f"kernel {kernel.name}: is not finite at r = 0, where it must be 0 if it is singular; "
+            "write it in powers of stokes.fmm.kernels.inverse_distance"
+        )
+
+
+def _check_agreement(kernel: Kernel, eps: float, options: FmmOptions, parallel: Parallel) -> None:
+    """Collective. Raise ValueError on all ranks where they do not ask for the same sum."""
+    if parallel.size == 1:
+        return
+    same = replace(options, threads=1)  # each rank's own
+    request = f"kernel {kernel.name}, length {kernel.length}, factor {kernel.factor}, {eps}, {same}"
+    first = parallel.broadcast(request)
+    with raised_together(parallel):
+        if request != first:
+            raise ValueError(f"not the same on all ranks: {request}; on rank 0 {first}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from numbers import Integral, Real
 from typing import Literal, get_args, get_type_hints
 
 Method = Literal["auto", "ufmm", "bbfmm", "symmetric"]
@@ -62,8 +63,10 @@ class FmmOptions:
         least_values = {"order": 1, "leaf_size": 1, "depth": 0, "near_memory": 0, "threads": 1}
         for name, least in least_values.items():
             value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"{name} = {value}: must be >= {least}")
+            kind = Real if name == "near_memory" else Integral
+            if value is not None and not (isinstance(value, kind) and value >= least):
+                whole = "a number" if kind is Real else "an integer"
+                raise ValueError(f"{name} = {value!r}: must be {whole} >= {least}")
         if self.order is not None and self.order > MAX_ORDER:
             raise ValueError(f"order = {self.order}: must be <= {MAX_ORDER}")
         if self.leaf_size is not None and self.depth is not None:

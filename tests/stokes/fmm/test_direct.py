@@ -70,9 +70,9 @@ def test_nothing_to_sum():
 @pytest.mark.parametrize(
     ("sources", "weights", "message"),
     [
-        (np.zeros((4, 2)), np.zeros(4), "sources has the shape"),
-        (np.zeros((4, 3)), np.zeros((4, 2)), "weights has the shape"),
-        (np.zeros((4, 3)), np.zeros(5), "weights has the shape"),
+        (np.zeros((4, 2)), np.zeros(4), "sources of shape"),
+        (np.zeros((4, 3)), np.zeros((4, 2)), "weights of shape"),
+        (np.zeros((4, 3)), np.zeros(5), "weights of shape"),
     ],
 )
 def test_wrong_shapes_are_refused(sources, weights, message):
@@ -95,5 +95,5 @@ def test_ranks_agree_with_one_rank(parallel, rhs):
 @pytest.mark.mpi(ranks=[1, 2, 3])
 def test_wrong_input_on_one_rank_is_everyones_error(parallel):
     width = 2 if parallel.rank == parallel.size - 1 else 3
-    with pytest.raises(ValueError, match="sources has the shape"):
+    with pytest.raises(ValueError, match="sources of shape"):
         direct_sum(laplace, np.zeros((4, width)), None, np.zeros(4), parallel)

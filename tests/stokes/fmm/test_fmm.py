@@ -334,6 +334,7 @@ def test_fmm3d_agrees_or_says_that_it_is_absent(name):
     [
         ({"eps": 0.0}, "eps"),
         ({"eps": np.nan}, "eps"),
+        ({"eps": "1e-3"}, "eps"),
         ({"sources": np.zeros((3, 2))}, "sources"),
         ({"sources": np.array([[0.0, np.inf, 0.0]])}, "finite"),
         ({"options": FmmOptions(derivative="interpolated")}, "derivative"),
@@ -348,17 +349,89 @@ def test_impossible_plans_are_refused(arguments, message):
 
 @pytest.mark.parametrize(
     "options",
-    [{"method": "fast"}, {"order": 0}, {"leaf_size": 0}, {"depth": 2, "leaf_size": 9}],
+    [
+        {"method": "fast"},
+        {"order": 0},
+        {"order": 4.5},
+        {"leaf_size": 0},
+        {"leaf_size": "9"},
+        {"near_memory": "1e9"},
+        {"depth": 2, "leaf_size": 9},
+    ],
 )
 def test_senseless_options_are_refused(options):
     with pytest.raises(ValueError, match="|".join(options)):
         FmmOptions(**options)
 
 
+@pytest.mark.parametrize("argument", ["kernel", "options", "parallel"])
+def test_arguments_of_another_kind_are_refused(argument):
+    request = {"kernel": laplace, "sources": cloud("cube", 20, 1)} | {argument: "laplace"}
+    with pytest.raises(TypeError, match=argument):
+        Fmm(**request)
+
+
+@register_jitable
+def _infinite_at_origin(x, y, z, w):
+    return (w[0] / np.sqrt(x * x + y * y + z * z),)
+
+
+def _not_compiled(x, y, z, w):
+    return (w[0],)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [(_infinite_at_origin, "not finite at r = 0"), (_not_compiled, "register_jitable")],
+)
+def test_kernels_that_break_the_rules_are_refused(function, message):
+    with pytest.raises(ValueError, match=message):
+        Fmm(Kernel("own", function, 1, 1), cloud("cube", 20, 1))
+
+
 def test_weights_of_another_shape_are_refused():
     plan = Fmm(stokeslet, cloud("cube", 20, 1))
     with pytest.raises(ValueError, match="weights of shape"):
         plan.apply(np.ones((20, 2)))
+    with pytest.raises(ValueError, match="complex"):
+        plan.apply(np.ones((20, 3), dtype=complex))
+    with pytest.raises(ValueError, match="values of shape"):
+        plan.estimate_error(np.ones((20, 3)), np.ones((20, 2)))
+
+
+@pytest.mark.mpi(ranks=[1, 2, 3])
+def test_wrong_input_on_one_rank_is_everyones_error(parallel):
+    """No rank is left waiting; all can go on afterwards."""
+    wrong = parallel.rank == parallel.size - 1
+    x = cloud("cube", 20, parallel.rank)
+    with pytest.raises(TypeError, match="kernel"):
+        Fmm("laplace" if wrong else laplace, x, parallel=parallel)
+    with pytest.raises(ValueError, match="eps"):
+        Fmm(laplace, x, eps="1e-3" if wrong else 1e-3, parallel=parallel)
+    plan = Fmm(laplace, x, eps=1e-3, parallel=parallel)
+    with pytest.raises(ValueError, match="could not convert"):
+        plan.apply(["a"] * 20 if wrong else np.ones(20))
+    values = plan.apply(np.ones(20))
+    with pytest.raises(ValueError, match="values of shape"):
+        plan.estimate_error(np.ones(20), values[: 5 if wrong else 20])
+    assert plan.estimate_error(np.ones(20), values).relative_l2 < 1e-3
+
+
+@pytest.mark.mpi(ranks=[2, 3])
+def test_different_requests_of_ranks_are_refused(parallel):
+    last = parallel.rank == parallel.size - 1
+    x = cloud("cube", 20, parallel.rank)
+    for request in (
+        {"kernel": KERNELS["inverse_square"] if last else laplace},
+        {"eps": 1e-3 if last else 1e-6},
+        {"options": FmmOptions(depth=2 if last else 1)},
+    ):
+        with pytest.raises(ValueError, match="not the same on all ranks"):
+            Fmm(**({"kernel": laplace, "sources": x, "parallel": parallel} | request))
+    options = FmmOptions(threads=1 + parallel.rank % 2)  # each rank's own affair
+    plan = Fmm(laplace, x, options=options, parallel=parallel)
+    with pytest.raises(ValueError, match="right-hand sides"):
+        plan.apply(np.ones((20, 1, 2 if last else 3)))
 
 
 # ---- ranks ------------------------------------------------------------------------------------
