@@ -39,12 +39,30 @@ _SMALLEST = 1e-10  # no smaller errors are of interest
 
 def main() -> None:
     """Measure errors, costs or both, and write the file."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--only", choices=("errors", "costs"))
-    parser.add_argument("--kernels", nargs="+", default=None, help="errors of these kernels only")
-    parser.add_argument("--grids", nargs="+", choices=tuple(_NODES), default=tuple(_NODES))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--only", choices=("errors", "costs"), help="measure these only")
     parser.add_argument(
-        "--file", type=Path, default=Path(__file__).with_name("constants.json"), metavar="FILE"
+        "--kernels",
+        nargs="+",
+        choices=tuple(KERNELS),
+        metavar="KERNEL",
+        help="errors of these kernels only, by name",
+    )
+    parser.add_argument(
+        "--grids",
+        nargs="+",
+        choices=tuple(_NODES),
+        default=tuple(_NODES),
+        help="errors of these grids only",
+    )
+    parser.add_argument(
+        "--file",
+        type=Path,
+        default=Path(__file__).with_name("constants.json"),
+        metavar="FILE",
+        help="write here, keeping what it has of others; plans read only %(default)s",
     )
     arguments = parser.parse_args()
     path = arguments.file
