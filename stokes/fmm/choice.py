@@ -70,11 +70,6 @@ class _Far:
     single: bool
     error: float
 
-    @property
-    def admissible(self) -> float:
-        """Order of the work of a transfer, to compare kinds of the same method."""
-        return self.nodes**3
-
 
 def choose(
     kernel: Kernel,
@@ -135,8 +130,19 @@ def _may_be_smooth(kernel: Kernel, far: _Far, options: FmmOptions, points: int) 
     """Whether a sum without near field is asked for, or worth the samples that it takes."""
     if options.admissibility != "auto":
         return options.admissibility == "smooth"
-    free = options.leaf_size is None and options.depth is None and options.order is None
+    free = options.depth is None and options.order is None and not not_of_smooth(options)
     return kernel.smooth and free and far.method == "ufmm" and points >= _WORTH_SAMPLES
+
+
+def not_of_smooth(options: FmmOptions) -> list[str]:
+    """Names of options that are given and mean nothing without near field, in double precision."""
+    given = {
+        "leaf_size": options.leaf_size is not None,
+        "precision": options.precision == "single",
+        "derivative": options.derivative == "interpolated",
+        "near": options.near == "cached",
+    }
+    return [name for name, is_given in given.items() if is_given]
 
 
 def _smooth_plan(
@@ -256,6 +262,7 @@ class Errors:
             if name in rows
         ]
         self._known = len(self._rows) == len(wanted)
+        self._samples: dict[tuple[int, bool], float] = {}
 
     def __call__(self, nodes: int, single: bool = False) -> float:
         """Largest relative error measured with so many nodes."""
@@ -275,10 +282,12 @@ class Errors:
         known = constants()["single"].get(self.kernel.name) if self._known else None
         return known or max(self._measured(ROUND_OFF_NODES, True), 1e-6)
 
-    @functools.cache  # noqa: B019 (an object of a plan's own short life)
     def _measured(self, nodes: int, single: bool) -> float:
-        scheme = sample_scheme(self.method, nodes, self.derivative, single)
-        return max(sum_error(self.kernel, scheme, "cube", edge) for edge in self._edges)
+        if (nodes, single) not in self._samples:
+            scheme = sample_scheme(self.method, nodes, self.derivative, single)
+            errors = [sum_error(self.kernel, scheme, "cube", edge) for edge in self._edges]
+            self._samples[nodes, single] = max(errors)
+        return self._samples[nodes, single]
 
 
 def row_name(method: str, derivative: str, edge: float | None) -> str:

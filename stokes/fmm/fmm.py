@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from dem_mpi.parallel import Parallel
 from stokes.fmm._requests import as_given, checked_points, columns_of, raised_together
 from stokes.fmm.backends import Direct, Fmm3d
-from stokes.fmm.choice import Choice, choose
+from stokes.fmm.choice import Choice, choose, not_of_smooth
 from stokes.fmm.direct import direct_sum
 from stokes.fmm.kernels import Kernel
 from stokes.fmm.options import ErrorEstimate, FmmOptions, FmmReport
@@ -235,6 +235,9 @@ def _check_request(kernel: Kernel, eps: float, options: FmmOptions, parallel: Pa
         raise ValueError(f"kernel {kernel.name} is not a derivative: derivative must be 'exact'")
     if options.admissibility == "smooth" and not kernel.smooth:
         raise ValueError(f"kernel {kernel.name} is not smooth at the origin: it has a near field")
+    if options.admissibility == "smooth" and not_of_smooth(options):
+        names = ", ".join(not_of_smooth(options))
+        raise ValueError(f"admissibility 'smooth' excludes the options given for: {names}")
     if options.precision == "single" and not kernel.single:
         raise ValueError(f"kernel {kernel.name} has no form in single precision")
     if options.backend == "fmm3d" and parallel.size > 1:

@@ -12,7 +12,7 @@ from numba.extending import register_jitable
 from dem_mpi.parallel import Parallel
 from stokes.fmm import KERNELS, Fmm, FmmOptions, Kernel, direct_sum
 from stokes.fmm.accuracy import DISTRIBUTIONS, cloud
-from stokes.fmm.kernels import stresslet_weights
+from stokes.fmm.kernels import gaussian, stresslet_weights
 from stokes.fmm.tree import Splitting
 from stokes.fmm.tree_sum import Scheme, TreeSum
 
@@ -339,12 +339,16 @@ def test_fmm3d_agrees_or_says_that_it_is_absent(name):
         ({"sources": np.array([[0.0, np.inf, 0.0]])}, "finite"),
         ({"options": FmmOptions(derivative="interpolated")}, "derivative"),
         ({"options": FmmOptions(admissibility="smooth", depth=2)}, "smooth"),
+        (
+            {"kernel": gaussian(), "options": FmmOptions(admissibility="smooth", leaf_size=9)},
+            "leaf_size",
+        ),
     ],
 )
 def test_impossible_plans_are_refused(arguments, message):
-    request = {"sources": cloud("cube", 20, 1)} | arguments
+    request = {"kernel": laplace, "sources": cloud("cube", 20, 1)} | arguments
     with pytest.raises(ValueError, match=message):
-        Fmm(laplace, **request)
+        Fmm(**request)
 
 
 @pytest.mark.parametrize(
