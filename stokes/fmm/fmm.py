@@ -11,6 +11,7 @@ between boxes of one level, passes downward and adds the near field (`tree_sum`)
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -51,6 +52,7 @@ class Fmm:
         kernel  : from `stokes.fmm.kernels`, or one of your own
         sources : (n, 3), targets (m, 3), this rank's, in any unit; None for the sources themselves.
                   A singular kernel leaves out the term of a source that coincides with the target
+                  Distances, in the unit, between 1e-150 and 1e150: their squares must not vanish
         eps     : ||u - u_direct||_2 / ||u_direct||_2 over all targets that is aimed at
 
         Raises ValueError for points that are not finite or not (n, 3), eps outside (0, 1),
@@ -88,6 +90,7 @@ class Fmm:
             self._choice = choose(
                 self.kernel, self._sources, self._points, self.eps, self.options, self._parallel
             )
+            self._warn_of_error()
             self._sum = TreeSum(
                 self.kernel,
                 self._sources,
@@ -97,11 +100,23 @@ class Fmm:
                 threads,
             )
 
+    def _warn_of_error(self) -> None:
+        """Say it where the asked error cannot be reached; who gave the order knows why."""
+        expected = self._choice.expected_error
+        if expected > self.eps and self.options.order is None:
+            warnings.warn(
+                f"eps = {self.eps:.1e} is out of reach for the kernel {self.kernel.name}: "
+                f"expected error {expected:.1e}",
+                RuntimeWarning,
+                stacklevel=4,
+            )
+
     def apply(self, weights: ArrayLike) -> NDArray:
         """Collective. The sums at this rank's targets.
 
         weights: (n, n_in), (n, n_in, r) for r right-hand sides, or (n,) if n_in = 1. Returns
-        (m, n_out), (m, n_out, r), or (m,) if weights are (n,) and n_out = 1.
+        (m, n_out), (m, n_out, r), or (m,) if weights are (n,) and n_out = 1. Values are finite for
+        finite weights; one weight that is not can make all values of its column NaN.
 
         Raises ValueError, on all ranks, for weights of another shape or complex ones.
         """

@@ -38,6 +38,8 @@ from stokes.fmm.tree import Splitting
 
 # Right-hand sides that pass through the stages together: a multiple of the near field's four.
 _TOGETHER = 8
+# Powers of two that weights in single precision may reach: half of the range for what they meet.
+_SAFE_EXPONENT = 63
 
 
 @dataclass(frozen=True)
@@ -309,11 +311,24 @@ class TreeSum:
 
     def apply(self, weights: NDArray) -> NDArray:
         """Collective. Sums (m, n_out, r) of weights (n, n_in, r), in the caller's order."""
+        exponent = self._weight_exponents(weights) if self.scheme.single else None
+        if exponent is not None:
+            return np.ldexp(self.apply(np.ldexp(weights, -exponent)), exponent)
         parts = [
             self._apply_some(weights[:, :, first : first + _TOGETHER])
             for first in range(0, max(weights.shape[2], 1), _TOGETHER)
         ]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)
+
+    def _weight_exponents(self, weights: NDArray) -> NDArray | None:
+        """Collective. Exponents (r,) of the largest weights, None if single precision holds them.
+
+        Weights near the ends of its range are summed in powers of two: nothing is rounded.
+        """
+        largest = np.abs(weights).max(axis=(0, 1), initial=0.0)
+        largest = self.points.parallel.max(np.nan_to_num(largest, posinf=0.0))
+        exponent = np.frexp(largest)[1]
+        return exponent if np.abs(exponent).max(initial=0) > _SAFE_EXPONENT else None
 
     def _apply_some(self, weights: NDArray) -> NDArray:
         """Some right-hand sides (n, n_in, r): upward, transfers, downward, near field.

@@ -209,6 +209,87 @@ def test_no_points_give_no_values():
     assert Fmm(stokeslet, some, empty).apply(np.ones((10, 3))).shape == (0, 3)
 
 
+def lattice(side):
+    """Points (side^3, 3): those of power-of-two sides lie on faces and corners of boxes."""
+    axis = np.arange(side) / (side - 1 if side % 2 else side)
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("side", [13, 12, 8, 9])
+@pytest.mark.parametrize("eps", [1e-3, 1e-6])
+def test_lattice_points_on_faces_of_boxes(side, eps):
+    x = lattice(side)
+    w = weights_of(stokeslet, len(x))
+    values = Fmm(stokeslet, x, eps=eps, options=FmmOptions(leaf_size=12)).apply(w)
+    exact = direct_sum(stokeslet, x, None, w)
+    for sign in (0, 1):
+        assert relative_error(values[:, :, sign], exact[:, :, sign]) <= eps
+
+
+@pytest.mark.parametrize("eps", [1e-3, 1e-6])
+@pytest.mark.parametrize("size", [1e-300, 1e-40, 1e40, 1e300])
+def test_weights_of_any_size(eps, size):
+    """Single precision ends at 1e38: weights beyond are scaled by powers of two."""
+    x, w = cloud("cube", 1000, 1), weights_of(laplace, 1000)
+    plan = Fmm(laplace, x, eps=eps, options=FmmOptions(leaf_size=25))
+    values = plan.apply(size * w) / size
+    assert np.isfinite(values).all()
+    assert relative_error(values, plan.apply(w)) < 1e-3 * eps
+    assert np.array_equal(plan.apply(0.0 * w), np.zeros((1000, 1, 2)))
+
+
+@pytest.mark.parametrize("size", [1e-150, 1e150])
+def test_coordinates_to_the_ends_of_their_range(size):
+    x, w = cloud("cube", 1000, 1), weights_of(laplace, 1000)
+    values = Fmm(laplace, x * size, options=FmmOptions(leaf_size=25)).apply(w)
+    assert relative_error(values * size, direct_sum(laplace, x, None, w)) <= 1e-6
+
+
+def test_weights_that_are_no_numbers_show():
+    x, w = cloud("cube", 1000, 1), np.ones((1000, 1, 2))
+    w[3, 0, 1] = np.nan
+    plan = Fmm(laplace, x, eps=1e-3, options=FmmOptions(leaf_size=25))
+    values = plan.apply(w)
+    neighbour = np.argsort(np.linalg.norm(x - x[3], axis=1))[1]
+    assert np.isnan(values[neighbour, 0, 1])
+    assert np.array_equal(plan.apply(np.ones(1000)), plan.apply(np.ones((1000, 1)))[:, 0])
+
+
+def test_layout_and_precision_of_the_input_do_not_matter():
+    """Strided, transposed, read-only arrays; numbers in single give what they are in double."""
+    x = cloud("cube", 1000, 1).astype(np.float32)
+    w = weights_of(stokeslet, 1000)[:, :, 0].astype(np.float32)
+    options = FmmOptions(leaf_size=25)
+    expected = Fmm(stokeslet, x.astype(float), options=options).apply(w.astype(float))
+    assert np.array_equal(Fmm(stokeslet, x, options=options).apply(w), expected)
+    strided, transposed = np.repeat(x, 2, axis=0)[::2], np.asfortranarray(w)
+    for array in (strided, transposed):
+        array.flags.writeable = False
+    assert np.array_equal(Fmm(stokeslet, strided, options=options).apply(transposed), expected)
+
+
+def test_plans_side_by_side_do_not_meet():
+    x, y = cloud("cube", 1000, 1), cloud("sphere", 1000, 2)
+    v, w = (weights_of(k, 1000)[:, :, 0] for k in (laplace, stokeslet))
+    options = FmmOptions(leaf_size=25)
+    first, second = Fmm(laplace, x, options=options), Fmm(stokeslet, y, options=options)
+    once = first.apply(v), second.apply(w)
+    again = first.apply(v), second.apply(w)
+    assert np.array_equal(once[0], again[0])
+    assert np.array_equal(once[1], again[1])
+    assert np.array_equal(once[0], Fmm(laplace, x, options=options).apply(v))
+
+
+def test_error_out_of_reach_is_told():
+    """1e-15 is below the round-off of every grid."""
+    x, w = cloud("cube", 1000, 1), weights_of(laplace, 1000)
+    with pytest.warns(RuntimeWarning, match="out of reach"):
+        plan = Fmm(laplace, x, eps=1e-15, options=FmmOptions(leaf_size=100))
+    assert plan.report.expected_error > 1e-15
+    assert "expected error" in plan.report.why
+    assert relative_error(plan.apply(w), direct_sum(laplace, x, None, w)) < 1e-9
+
+
 # ---- Stokes flow ------------------------------------------------------------------------------
 
 
