@@ -151,7 +151,17 @@ class Kernel:
             raise ValueError(f"kernel {self.name}: no kernel is known for its transpose")
         if self.transpose == self.name:
             return self
-        return replace(KERNELS[self.transpose], length=self.length, factor=self.factor)
+        return KERNELS[self.transpose].scaled(self.length, self.factor)
+
+    def scaled(self, length: float, factor: float) -> Kernel:
+        """The kernel with another length and factor, and its base so that it stays its gradient."""
+        base = self.base
+        if base is not None:
+            stretched = length / self.length
+            base = base.scaled(
+                base.length * stretched, base.factor * stretched * factor / self.factor
+            )
+        return replace(self, length=length, factor=factor, base=base)
 
 
 @functools.cache
