@@ -34,6 +34,8 @@ from stokes.fmm.tree_sum import Scheme, grid_of, single_pairs
 SAFETY = 0.8
 # Most nodes tried. Equispaced polynomials lose a digit to round-off every 3 nodes.
 MOST_NODES = {"ufmm": 18, "bbfmm": 20, "symmetric": 20}
+# Of tensors on Chebyshev grids: beyond it operators of low rank take minutes to find.
+_MOST_TENSOR_NODES = 14
 _LEAST_NODES = 3
 # Nodes with which the round-off of single precision is measured; it grows with more.
 ROUND_OFF_NODES = 7
@@ -227,7 +229,7 @@ def _choose_far(kernel: Kernel, eps: float, options: FmmOptions, edge: float) ->
             found.append(_in_precision(far, errors, eps, options))
         good = [far for far in found if options.order or far.error <= SAFETY * eps]
         if good:
-            return min(good, key=lambda far: _transfer_work(kernel, far)), _reason(good[0], method)
+            return min(good, key=lambda far: _transfer_work(kernel, far)), _reason(options, method)
         closest = min(found, key=lambda far: far.error)
         best = closest if best is None or closest.error < best.error else best
     return best, (
@@ -236,10 +238,14 @@ def _choose_far(kernel: Kernel, eps: float, options: FmmOptions, edge: float) ->
     )
 
 
-def _reason(far: _Far, method: str) -> str:
+def _reason(options: FmmOptions, method: str) -> str:
+    if options.order:
+        return f"order {options.order} was asked for, whatever error it reaches"
+    if options.method != "auto":
+        return f"{method} was asked for"
     if method == "ufmm":
         return "equispaced grids reach the error"
-    return "equispaced grids are unstable for this error, or were not asked for"
+    return "equispaced grids are unstable for this error"
 
 
 def _transfer_work(kernel: Kernel, far: _Far) -> float:
@@ -331,7 +337,10 @@ def _interpolated(table: dict[int, float], nodes: int, beyond: int) -> float:
 def _enough_nodes(errors: Errors, eps: float) -> _Far:
     """Fewest nodes whose error is small enough; else those of the smallest error."""
     best = None
-    for nodes in range(_LEAST_NODES, MOST_NODES[errors.method] + 1):
+    most = MOST_NODES[errors.method]
+    if errors.method != "ufmm" and errors.kernel.n_in * errors.kernel.n_out > 1:
+        most = _MOST_TENSOR_NODES
+    for nodes in range(_LEAST_NODES, most + 1):
         far = _Far(errors.method, nodes, errors.derivative, False, errors(nodes))
         if far.error <= SAFETY * eps:
             return far
