@@ -111,6 +111,11 @@ class MatrixTransfer(ABC):
         """Memory of the operators."""
         return sum(table.bytes for table in self._tables.values())
 
+    @property
+    def spectra_bytes(self) -> int:
+        """0: there are no spectra."""
+        return 0
+
     def add(
         self,
         level: int,

@@ -89,7 +89,7 @@ class FmmReport:
     boxes           : in this rank's table, those of other ranks' points included
     pairs           : by list: of points ("near"), of boxes ("far"), of nodes and points
                       ("multipole_to_target", "source_to_local")
-    memory          : bytes by part
+    memory          : bytes by part; "spectra" are taken by the first application
     plan_seconds    : wall clock by phase, compilation included
     """
 

@@ -101,8 +101,13 @@ class FourierTransfer:
 
     @property
     def bytes(self) -> int:
-        """Memory of the tables and, once used, of the spectra."""
-        return sum(table.nbytes for table in self._tables.values()) + self._work.nbytes
+        """Memory of the tables."""
+        return sum(table.nbytes for table in self._tables.values())
+
+    @property
+    def spectra_bytes(self) -> int:
+        """Memory of the spectra of multipoles and locals, kept once used for the next `apply`."""
+        return self._work.nbytes
 
     def add(
         self,

@@ -305,6 +305,7 @@ class TreeSum:
                 )
             ),
             "tables": int(self.transfer.bytes),
+            "spectra": self.transfer.spectra_bytes,
             "near": 0 if self.near_matrices is None else self.near_matrices.nbytes,
             "expansions": moment * len(self.boxes) * (self._far.n_in + self._far.n_out),
         }

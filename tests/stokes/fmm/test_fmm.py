@@ -386,6 +386,11 @@ def test_report_tells_what_was_planned():
     assert report.pairs["near"] > 0
     assert report.pairs["far"] > 0
     assert sum(report.memory.values()) > 0
+    assert report.memory["spectra"] == 0
+    plan.apply(weights_of(stokeslet, len(x)))
+    applied = plan.report
+    assert applied.memory["spectra"] > 0
+    assert {**applied.memory, "spectra": 0} == report.memory
     assert set(report.plan_seconds) == {"tree", "lists", "tables", "near"}
     assert report.compile_seconds >= 0.0
 
