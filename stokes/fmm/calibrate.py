@@ -1,14 +1,16 @@
 """Measure the constants by which plans are chosen: `python -m stokes.fmm.calibrate`.
 
-Writes `constants.json` beside this file (or FILE): errors by kernel, grid and nodes, which depend
-on no machine, and nanoseconds of this machine on one thread. Takes about ten minutes; run it on
-an idle machine. Plans read the file only; nothing is timed when sums are made.
+Writes `constants.json` beside this file, the only one that plans read: errors by kernel, grid and
+nodes, which depend on no machine, and nanoseconds of this machine on one thread. What is not
+measured stays as it was. Takes about ten minutes; run it on an idle machine. Nothing is timed when
+sums are made.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
@@ -26,6 +28,7 @@ from stokes.fmm.near_matrices import NearMatrices
 from stokes.fmm.tree import Splitting
 from stokes.fmm.tree_sum import Scheme, TreeSum
 
+_FILE = Path(__file__).with_name("constants.json")
 _NODES = {
     "equispaced": (3, 4, 5, 6, 7, 8, 10, 12, 14),
     "chebyshev": (3, 4, 6, 8, 10),
@@ -57,16 +60,10 @@ def main() -> None:
         default=tuple(_NODES),
         help="errors of these grids only",
     )
-    parser.add_argument(
-        "--file",
-        type=Path,
-        default=Path(__file__).with_name("constants.json"),
-        metavar="FILE",
-        help="write here, keeping what it has of others; plans read only %(default)s",
-    )
     arguments = parser.parse_args()
-    path = arguments.file
-    constants = json.loads(path.read_text()) if path.exists() else {"errors": {}, "single": {}}
+    if not os.access(_FILE, os.W_OK):
+        parser.error(f"{_FILE} cannot be written: install the package where you may write")
+    constants = json.loads(_FILE.read_text())
     if arguments.only != "costs":
         wanted = list(KERNELS.values())
         if arguments.kernels:
@@ -76,17 +73,17 @@ def main() -> None:
             rows.update(errors_of(kernel, arguments.grids))
             if kernel.single:
                 constants["single"][kernel.name] = round_off_of(kernel)
-            _write(path, constants)
+            _write(constants)
     if arguments.only != "errors":
         constants["nanoseconds"] = {
             "double": nanoseconds(single=False),
             "single": nanoseconds(single=True),
         }
-    _write(path, constants)
+    _write(constants)
 
 
-def _write(path: Path, constants: dict[str, Any]) -> None:
-    path.write_text(json.dumps(constants, indent=1, sort_keys=True) + "\n")
+def _write(constants: dict[str, Any]) -> None:
+    _FILE.write_text(json.dumps(constants, indent=1, sort_keys=True) + "\n")
 
 
 def errors_of(kernel: Kernel, grids: Sequence[str]) -> dict[str, dict[str, float]]:

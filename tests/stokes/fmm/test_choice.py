@@ -7,7 +7,7 @@ import pytest
 from numba.extending import register_jitable
 
 from dem_mpi.parallel import Parallel
-from stokes.fmm import KERNELS, Fmm, FmmOptions, Kernel
+from stokes.fmm import KERNELS, Fmm, FmmOptions, Kernel, calibrate
 from stokes.fmm.accuracy import cloud
 from stokes.fmm.choice import MOST_NODES, SAFETY, Cost, Errors, choose, constants
 from stokes.fmm.tree import Splitting, build, root_cube, sort
@@ -121,3 +121,11 @@ def test_plan_does_not_depend_on_ranks(parallel):
     x = cloud("prolate", 150_000, 1)
     mine = np.array_split(x, parallel.size)[parallel.rank]
     assert choice(stokeslet, mine, 1e-4, parallel) == choice(stokeslet, x, 1e-4)
+
+
+def test_calibration_refuses_constants_it_cannot_write_before_it_measures(monkeypatch, capsys):
+    monkeypatch.setattr(calibrate.os, "access", lambda path, mode: False)
+    monkeypatch.setattr("sys.argv", ["calibrate"])
+    with pytest.raises(SystemExit):
+        calibrate.main()
+    assert "constants.json cannot be written" in capsys.readouterr().err
