@@ -29,9 +29,10 @@ import hashlib
 import inspect
 import itertools
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numba
 import numpy as np
@@ -634,17 +635,36 @@ stokes_stress = Kernel(
 
 
 def stresslet_weights(density: ArrayLike, normals: ArrayLike) -> NDArray:
-    """Weights (n, 6) of `stresslet` for a double layer: density (n, 3), outward normals (n, 3)."""
-    product = np.einsum("nj,nk->njk", density, normals)
+    """Weights (n, 6) of `stresslet` for a double layer: density (n, 3), outward normals (n, 3).
+
+    Raises ValueError for other shapes, and unlike numbers of rows.
+    """
+    q, n = _rows(density=(density, 3), normals=(normals, 3))
+    product = np.einsum("nj,nk->njk", q, n)
     both = product + product.transpose(0, 2, 1)
     return np.stack([(product if j == k else both)[:, j, k] for j, k in SYMMETRIC], axis=1)
 
 
 def traction(stress: ArrayLike, normals: ArrayLike) -> NDArray:
-    """sigma n (n, 3) of stresses (n, 6) in the order 00, 11, 22, 12, 02, 01 and normals (n, 3)."""
-    s, n = np.asarray(stress), np.asarray(normals)
+    """sigma n (n, 3) of stresses (n, 6) in the order 00, 11, 22, 12, 02, 01 and normals (n, 3).
+
+    Raises ValueError for other shapes, and unlike numbers of rows.
+    """
+    s, n = _rows(stress=(stress, 6), normals=(normals, 3))
     row = [[SYMMETRIC.index(_sorted((i, j))) for j in range(3)] for i in range(3)]
     return np.einsum("nij,nj->ni", s[:, row], n)
+
+
+def _rows(**given: tuple[ArrayLike, int]) -> list[NDArray]:
+    """The arrays (n, width) of name=(array, width); ValueError for others and unequal n."""
+    arrays = [np.asarray(array) for array, _ in given.values()]
+    for name, array, (_, width) in zip(given, arrays, given.values(), strict=True):
+        if array.ndim != 2 or array.shape[1] != width:
+            raise ValueError(f"{name} of shape {array.shape}: must be (n, {width})")
+    if len({len(array) for array in arrays}) > 1:
+        counts = " and ".join(str(len(array)) for array in arrays)
+        raise ValueError(f"{', '.join(given)}: {counts} rows, must be as many of each")
+    return arrays
 
 
 # --- softened distance r_a = sqrt(r^2 + a^2) ---------------------------------------------------
@@ -728,16 +748,14 @@ def _of_softened_distance(name: str, apply: Callable, order: int, length: float)
     )
 
 
-KERNELS: dict[str, Kernel] = {
-    kernel.name: kernel
-    for kernel in (
-        *(laplace, inverse_square, inverse_fourth, gaussian(), exponential(), matern52()),
-        *(laplace_gradient, laplace_dipole, laplace_dipole_gradient),
-        *(laplace_quadrupole, laplace_hessian),
-        *(stokeslet, stokeslet_pressure, stokeslet_gradient),
-        *(stresslet, stresslet_pressure, stokes_stress),
-        *(softened(), softened_distance_gradient()),
-        *(softened_distance_hessian(), softened_distance_third()),
-    )
-}
+_EVERY = (
+    *(laplace, inverse_square, inverse_fourth, gaussian(), exponential(), matern52()),
+    *(laplace_gradient, laplace_dipole, laplace_dipole_gradient),
+    *(laplace_quadrupole, laplace_hessian),
+    *(stokeslet, stokeslet_pressure, stokeslet_gradient),
+    *(stresslet, stresslet_pressure, stokes_stress),
+    *(softened(), softened_distance_gradient()),
+    *(softened_distance_hessian(), softened_distance_third()),
+)
+KERNELS: Mapping[str, Kernel] = MappingProxyType({kernel.name: kernel for kernel in _EVERY})
 """All kernels by name; those with a length at length 1."""

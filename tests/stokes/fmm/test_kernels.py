@@ -490,3 +490,19 @@ def test_second_process_loads_the_loop_and_an_edited_kernel_is_compiled_anew(tmp
     assert run("2.0") == [1.0, 0]
     assert run("2.0") == [1.0, 1]
     assert run("6.0") == [3.0, 0]
+
+
+@pytest.mark.parametrize(("function", "width"), [(stresslet_weights, 3), (traction, 6)])
+def test_rows_of_other_shapes_are_refused_by_name(function, width):
+    rows, normals = np.ones((4, width)), np.ones((4, 3))
+    with pytest.raises(ValueError, match=rf"of shape \(4, 2\): must be \(n, {width}\)"):
+        function(rows[:, :2], normals)
+    with pytest.raises(ValueError, match=r"normals of shape \(3,\): must be \(n, 3\)"):
+        function(rows, normals[0])
+    with pytest.raises(ValueError, match="4 and 1 rows"):
+        function(rows, normals[:1])
+
+
+def test_the_kernels_of_the_package_cannot_be_replaced():
+    with pytest.raises(TypeError):
+        KERNELS["laplace"] = KERNELS["stokeslet"]
