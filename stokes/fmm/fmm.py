@@ -74,6 +74,15 @@ class Fmm:
         with self._compiling():
             self._build()
 
+    def __repr__(self) -> str:
+        """Kernel, this rank's points, the asked error, and how it is reached."""
+        sources, targets = len(self._sources), len(self._points)
+        points = f"{sources} points" if self._targets is None else f"{sources} to {targets} points"
+        how = f"backend={self.options.backend!r}"
+        if self._choice is not None:
+            how = f"{self._choice.scheme.method}, {self._choice.scheme.nodes} nodes"
+        return f"<Fmm {self.kernel.name}, {points}, eps={self.eps:.3g}, {how}>"
+
     @property
     def _points(self) -> NDArray:
         """The targets (m, 3)."""
