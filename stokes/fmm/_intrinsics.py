@@ -1,4 +1,4 @@
-"""Instructions for compiled loops over pairs: tuples held in registers, bits of numbers."""
+"""What compiled loops over pairs are written with: tuples held in registers, bits of numbers."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from typing import Any
 
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.extending import intrinsic, register_jitable
+
+# Sums may be reordered and products contracted; NaN and infinity keep their meaning.
+REORDERED = {"reassoc", "contract", "nsz", "arcp"}
 
 
 @intrinsic
@@ -68,3 +71,21 @@ def from_bits(typingctx: Any, integer: Any) -> Any:
         return builder.bitcast(arguments[0], context.get_value_type(result))
 
     return result(integer), generate
+
+
+@register_jitable
+def middle(points, first, last):
+    """Middle (x, y, z) of the smallest box about points (3, n) [first, last)."""
+    return (
+        _middle(points[0], first, last),
+        _middle(points[1], first, last),
+        _middle(points[2], first, last),
+    )
+
+
+@register_jitable
+def _middle(values, first, last):
+    low = high = values[first]
+    for i in range(first + 1, last):
+        low, high = min(low, values[i]), max(high, values[i])
+    return 0.5 * (low + high)

@@ -19,9 +19,8 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from dem_mpi._jit import jit, jit_threads
-from stokes.fmm._intrinsics import load_components
+from stokes.fmm._intrinsics import load_components, middle
 from stokes.fmm.kernels import Kernel, digest
-from stokes.fmm.near_field import _middle
 
 # Standard deviation of the rounded distance of two points, as a part of the group's extent, is
 # 2^-26 sqrt(2/3): closer pairs than this over the error have less than half of the asked digits.
@@ -160,9 +159,9 @@ def _centres(targets: NDArray, target_range: NDArray, first: NDArray) -> NDArray
     centre = np.empty((first[-1], 3))
     for g in range(len(target_range)):
         if first[g] < first[g + 1]:
-            for d in range(3):
-                middle = _middle(targets[d], target_range[g, 0], target_range[g, 1])
-                centre[first[g] : first[g + 1], d] = middle
+            x, y, z = middle(targets, target_range[g, 0], target_range[g, 1])
+            for p in range(first[g], first[g + 1]):
+                centre[p, 0], centre[p, 1], centre[p, 2] = x, y, z
     return centre
 
 

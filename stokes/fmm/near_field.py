@@ -11,7 +11,7 @@ Stokeslet on one core of a Zen 5 with vectors of 512 bits, reading 1 or 9 stored
 2.5 ns. `near_matrices` is for the kernels that take longer. Four right-hand sides share what is
 computed of r.
 
-Arithmetic: sums may be reordered and products contracted (`_REORDERED`), which the vector units
+Arithmetic: sums may be reordered and products contracted (`REORDERED`), which the vector units
 need; NaN and infinity keep their meaning. The order depends on the groups only, never on threads.
 """
 
@@ -26,10 +26,10 @@ from numba import prange
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from stokes.fmm._intrinsics import add_components, load_components
+from stokes.fmm._intrinsics import REORDERED, add_components, load_components, middle
+from stokes.fmm._threads import limited_threads
 from stokes.fmm.kernels import Kernel, digest
 
-_REORDERED = {"reassoc", "contract", "nsz", "arcp"}
 _ROW = 4096  # bytes of a tile's row: six rows take half of a first-level cache
 _VECTORS = 256  # bytes; a row is filled up to a multiple: four vectors
 
@@ -76,18 +76,17 @@ class NearField:
         Groups of targets must not overlap if there is more than one thread.
         """
         self._check(targets, sources, weights, out)
-        if self.threads > 1:
-            numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))
         lists = [np.ascontiguousarray(a, np.int64) for a in (target_range, start, source_range)]
 
         def run(loop: Callable, weights: NDArray, out: NDArray) -> None:
             scale, factor = 1.0 / self.kernel.length, self.kernel.factor
             loop(targets, sources, *lists, weights, scale, factor, out)
 
-        if weights.ndim == 2:
-            run(self.loop, weights, out)
-        else:
-            self._add_in_fours(run, weights, out)
+        with limited_threads(self.threads):
+            if weights.ndim == 2:
+                run(self.loop, weights, out)
+            else:
+                self._add_in_fours(run, weights, out)
 
     def _add_in_fours(self, run: Callable, weights: NDArray, out: NDArray) -> None:
         """The same for weights (r, n_in, ns); a last group of two or three is filled up."""
@@ -140,11 +139,7 @@ def _loop(
             first, last = target_range[g, 0], target_range[g, 1]
             if first == last:
                 continue
-            centre = (
-                _middle(targets[0], first, last),
-                _middle(targets[1], first, last),
-                _middle(targets[2], first, last),
-            )
+            centre = middle(targets, first, last)
             tile = np.empty((rows, columns), real)
             filled = 0
             for k in range(start[g], start[g + 1]):
@@ -172,15 +167,6 @@ def _loop(
 
 
 @register_jitable
-def _middle(values, first, last):
-    """Middle of the smallest and largest of values [first, last)."""
-    low = high = values[first]
-    for i in range(first + 1, last):
-        low, high = min(low, values[i]), max(high, values[i])
-    return 0.5 * (low + high)
-
-
-@register_jitable
 def _gather(sources, weights, begin, count, centre, scale, tile, filled):
     """Copy sources [begin, begin + count) to the columns of the tile from `filled` on."""
     for d in range(3):
@@ -205,7 +191,7 @@ def _whole_vectors(tile, filled):
     return -(-filled // vector) * vector
 
 
-@register_jitable(fastmath=_REORDERED)
+@register_jitable(fastmath=REORDERED)
 def _sum_tile(
     apply, zero_in, zero_out, targets, first, last, centre, scale, tile, filled, factor, out
 ):
@@ -225,7 +211,7 @@ def _sum_tile(
             out[o, i] += factor * total[o]
 
 
-@register_jitable(fastmath=_REORDERED)
+@register_jitable(fastmath=REORDERED)
 def _sum_tile_of_four(
     apply, zero_in, zero_out, targets, first, last, centre, scale, tile, filled, factor, out
 ):

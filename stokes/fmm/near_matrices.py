@@ -23,10 +23,10 @@ from numba import prange
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from stokes.fmm._intrinsics import add_components, load_components
+from stokes.fmm._intrinsics import REORDERED, add_components, load_components, middle
+from stokes.fmm._threads import limited_threads
 from stokes.fmm.kernels import Kernel, digest
 
-_REORDERED = {"reassoc", "contract", "nsz", "arcp"}
 _COLUMNS = 256  # of a tile: eight rows of weights take a third of a first-level cache
 _VECTOR = 64  # bytes; rows of a tile are filled up to a multiple with zeros
 _TOGETHER = (1, 4, 8)
@@ -75,8 +75,9 @@ class NearMatrices:
             *(kernel.apply, kernel.n_in, kernel.n_out, self._layout.real.type),
             *(self._layout.width, threads > 1, digest(kernel.apply)),
         )
-        self._set_threads()
-        fill(targets, sources, *self._lists, 1.0 / kernel.length, self._offset, self._entries)
+        scale = 1.0 / kernel.length
+        with limited_threads(threads):
+            fill(targets, sources, *self._lists, scale, self._offset, self._entries)
 
     @property
     def nbytes(self) -> int:
@@ -85,7 +86,6 @@ class NearMatrices:
 
     def add(self, weights: NDArray, out: NDArray) -> None:
         """Add the sums for weights (r, n_in, ns) to out (r, n_out, nt), both float64."""
-        self._set_threads()
         most = _TOGETHER[-1]
         for k in range(0, len(weights), most):
             some = slice(k, k + most)
@@ -95,11 +95,8 @@ class NearMatrices:
                 *(self._layout.width, together, self.threads > 1),
             )
             factor = self.kernel.factor
-            loop(self._entries, self._offset, *self._lists, weights[some], factor, out[some])
-
-    def _set_threads(self) -> None:
-        if self.threads > 1:
-            numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))
+            with limited_threads(self.threads):
+                loop(self._entries, self._offset, *self._lists, weights[some], factor, out[some])
 
 
 class _Layout:
@@ -142,11 +139,7 @@ def _fill_loop(
             first, last = target_range[g, 0], target_range[g, 1]
             if first == last:
                 continue
-            centre = (
-                _middle(targets[0], first, last),
-                _middle(targets[1], first, last),
-                _middle(targets[2], first, last),
-            )
+            centre = middle(targets, first, last)
             unit = np.eye(n_in).astype(real)
             gathered, tile = np.empty((1, 3 * width)), np.empty((3, width))
             left = _listed(source_range, start[g], start[g + 1])
@@ -167,15 +160,6 @@ def _fill_loop(
                 left -= count
 
     return fill
-
-
-@register_jitable
-def _middle(values, first, last):
-    """Middle of the smallest and largest of values [first, last)."""
-    low = high = values[first]
-    for i in range(first + 1, last):
-        low, high = min(low, values[i]), max(high, values[i])
-    return 0.5 * (low + high)
 
 
 @register_jitable
@@ -209,7 +193,7 @@ def _gather(rows, source_range, k, skip, count, stride, tile):
     return k, skip
 
 
-@register_jitable(fastmath=_REORDERED)
+@register_jitable(fastmath=REORDERED)
 def _evaluate(apply, zero_in, unit, targets, first, centre, scale, tile, count, block):
     """The entries (n_out, rows, n_in, columns) of targets from `first` on and `count` sources.
 
@@ -267,7 +251,7 @@ def _product_loop(
     return multiply
 
 
-@register_jitable(fastmath=_REORDERED)
+@register_jitable(fastmath=REORDERED)
 def _row_times_tile(scaled, zero, row, tile):
     """Products of one row of a matrix with each row of the tile."""
     total = zero
@@ -276,17 +260,17 @@ def _row_times_tile(scaled, zero, row, tile):
     return total
 
 
-@register_jitable(fastmath=_REORDERED)
+@register_jitable(fastmath=REORDERED)
 def _scaled_one(w, k):
     return (k * w[0],)
 
 
-@register_jitable(fastmath=_REORDERED)
+@register_jitable(fastmath=REORDERED)
 def _scaled_four(w, k):
     return (k * w[0], k * w[1], k * w[2], k * w[3])
 
 
-@register_jitable(fastmath=_REORDERED)
+@register_jitable(fastmath=REORDERED)
 def _scaled_eight(w, k):
     return (
         *(k * w[0], k * w[1], k * w[2], k * w[3]),

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, fields
 from numbers import Integral, Real
 from typing import Literal, get_args, get_type_hints
 
+from stokes.fmm._threads import most_threads
+
 Method = Literal["auto", "ufmm", "bbfmm", "symmetric"]
 Precision = Literal["auto", "double", "single"]
 Derivative = Literal["auto", "exact", "interpolated"]
@@ -36,7 +38,7 @@ class FmmOptions:
                     they fit. Neither changes results by more than round-off
     near_memory   : most bytes of such matrices on a rank; where one rank has more, "auto" stores
                     none on any, and "cached" is an error
-    threads       : of this rank
+    threads       : of this rank, at most those of the machine
     """
 
     method: Method = "auto"
@@ -69,6 +71,8 @@ class FmmOptions:
                 raise ValueError(f"{name} = {value!r}: must be {whole} >= {least}")
         if self.order is not None and self.order > MAX_ORDER:
             raise ValueError(f"order = {self.order}: must be <= {MAX_ORDER}")
+        if self.threads > most_threads():
+            raise ValueError(f"threads = {self.threads}: there are {most_threads()}")
         if self.leaf_size is not None and self.depth is not None:
             raise ValueError("leaf_size and depth exclude each other: give one of them")
 

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dem_mpi.parallel import Parallel
+from stokes.fmm._threads import limited_threads
 from stokes.fmm.chebyshev import CompressedTransfer, SymmetricTransfer
 from stokes.fmm.close_pairs import ClosePairs
 from stokes.fmm.distribution import Distribution
@@ -116,6 +117,7 @@ class TreeSum:
         """
         self.kernel = kernel
         self.scheme = scheme
+        self._threads = threads
         self._clock = clock
         self.plan_seconds: dict[str, float] = {}
         self.apply_seconds: dict[str, float] = {}
@@ -131,10 +133,11 @@ class TreeSum:
             self._set_unit()
         with self._timed(self.plan_seconds, "lists"):
             self.lists = self.points.lists
-        with self._timed(self.plan_seconds, "tables"):
-            self._set_tables(threads)
-        with self._timed(self.plan_seconds, "near"):
-            self._set_near(threads)
+        with limited_threads(threads):
+            with self._timed(self.plan_seconds, "tables"):
+                self._set_tables(threads)
+            with self._timed(self.plan_seconds, "near"):
+                self._set_near(threads)
 
     @contextmanager
     def _timed(self, seconds: dict[str, float], name: str) -> Iterator[None]:
@@ -315,10 +318,11 @@ class TreeSum:
         exponent = self._weight_exponents(weights) if self.scheme.single else None
         if exponent is not None:
             return np.ldexp(self.apply(np.ldexp(weights, -exponent)), exponent)
-        parts = [
-            self._apply_some(weights[:, :, first : first + _TOGETHER])
-            for first in range(0, max(weights.shape[2], 1), _TOGETHER)
-        ]
+        with limited_threads(self._threads):
+            parts = [
+                self._apply_some(weights[:, :, first : first + _TOGETHER])
+                for first in range(0, max(weights.shape[2], 1), _TOGETHER)
+            ]
         return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)
 
     def _weight_exponents(self, weights: NDArray) -> NDArray | None:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import functools
 import importlib.util
 
+import numba
 import numpy as np
 import pytest
 from numba.extending import register_jitable
 
 from dem_mpi.parallel import Parallel
 from stokes.fmm import KERNELS, Fmm, FmmOptions, Kernel, direct_sum
+from stokes.fmm._threads import most_threads
 from stokes.fmm.accuracy import DISTRIBUTIONS, cloud
 from stokes.fmm.kernels import gaussian, stresslet_weights
 from stokes.fmm.tree import Splitting
@@ -395,6 +397,14 @@ def test_report_tells_what_was_planned():
     assert report.compile_seconds >= 0.0
 
 
+def test_a_plan_shows_what_it_sums_and_how():
+    x = cloud("cube", 50, 1)
+    same = Fmm(laplace, x, eps=1e-3, options=FmmOptions(order=4))
+    assert repr(same) == "<Fmm laplace, 50 points, eps=0.001, ufmm, 5 nodes>"
+    apart = Fmm(laplace, x, x[:7], options=FmmOptions(backend="direct"))
+    assert repr(apart) == "<Fmm laplace, 50 to 7 points, eps=1e-06, backend='direct'>"
+
+
 def test_direct_backend_is_the_direct_sum():
     x = cloud("cube", 500, 1)
     w = weights_of(stokeslet, 500)
@@ -518,7 +528,8 @@ def test_different_requests_of_ranks_are_refused(parallel):
     ):
         with pytest.raises(ValueError, match="not the same on all ranks"):
             Fmm(**({"kernel": laplace, "sources": x, "parallel": parallel} | request))
-    options = FmmOptions(threads=1 + parallel.rank % 2)  # each rank's own affair
+    threads = min(1 + parallel.rank % 2, most_threads())  # each rank's own affair
+    options = FmmOptions(threads=threads)
     plan = Fmm(laplace, x, options=options, parallel=parallel)
     with pytest.raises(ValueError, match="right-hand sides"):
         plan.apply(np.ones((20, 1, 2 if last else 3)))
@@ -545,3 +556,23 @@ def test_values_do_not_depend_on_the_number_of_ranks(parallel):
         estimate = plan.estimate_error(w[mine], values, samples=400)
         assert estimate.samples == 400
         assert estimate.relative_l2 <= 1e-6
+
+
+def test_more_threads_than_there_are_are_refused():
+    FmmOptions(threads=most_threads())
+    with pytest.raises(ValueError, match=f"there are {most_threads()}"):
+        FmmOptions(threads=most_threads() + 1)
+
+
+@pytest.mark.skipif(most_threads() < 2, reason="needs two threads")
+@pytest.mark.parametrize("near", ["cached", "recomputed"])
+def test_sums_leave_the_number_of_threads_as_it_was(near):
+    x, before = cloud("cube", 500, 1), numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        plan = Fmm(laplace, x, eps=1e-2, options=FmmOptions(threads=2, near=near, leaf_size=30))
+        plan.apply(weights_of(laplace, len(x)))
+        direct_sum(laplace, x, None, weights_of(laplace, len(x)), threads=2)
+        assert numba.get_num_threads() == 1
+    finally:
+        numba.set_num_threads(before)
