@@ -41,6 +41,10 @@ class _Vectors:
     def load(self, data: Any, offset: Any) -> Any:
         return self.builder.load(self._pointer(data, offset), align=self._align)
 
+    def load_complex(self, data: Any, offset: Any) -> tuple[Any, Any]:
+        behind = self.builder.add(offset, ir.Constant(offset.type, self.lanes))
+        return self.load(data, offset), self.load(data, behind)
+
     def store(self, value: Any, data: Any, offset: Any) -> None:
         self.builder.store(value, self._pointer(data, offset), align=self._align)
 
@@ -92,6 +96,40 @@ def _data(context: Any, builder: Any, array_type: Any, value: Any) -> Any:
     return context.make_array(array_type)(context, builder, value).data
 
 
+def _complex_sum(vectors: _Vectors, split: bool) -> list[Any]:
+    """Variables, at zero, of real and imaginary part; `split`: two of each, to be added."""
+    count = 4 if split else 2
+    return [cgutils.alloca_once_value(vectors.builder, vectors.zero) for _ in range(count)]
+
+
+def _add_complex_product(vectors: _Vectors, a: Any, b: Any, total: list[Any]) -> None:
+    """total += a b; products with the imaginary part of a go to the second half of a split one."""
+    builder, second = vectors.builder, len(total) - 2
+    terms = (
+        (vectors.add_product, a[0], b[0], 0),
+        (vectors.add_product, a[0], b[1], 1),
+        (vectors.subtract_product, a[1], b[1], second),
+        (vectors.add_product, a[1], b[0], second + 1),
+    )
+    for add, x, y, part in terms:
+        builder.store(add(x, y, builder.load(total[part])), total[part])
+
+
+def _store_complex_sum(
+    vectors: _Vectors, total: list[Any], data: Any, offset: Any, onto: bool
+) -> None:
+    """Put the sum at the offset, or, with `onto`, add it to what is there."""
+    builder = vectors.builder
+    for part in range(2):
+        here = builder.add(offset, ir.Constant(offset.type, part * vectors.lanes))
+        value = builder.load(total[part])
+        for other in total[part + 2 :: 2]:
+            value = vectors.add(value, builder.load(other))
+        if onto:
+            value = vectors.add(value, vectors.load(data, here))
+        vectors.store(value, data, here)
+
+
 def _products(targets: int, outputs: int, onto: bool = False) -> Any:
     """Make the inner loop of the transfer for this many targets and outputs at a time.
 
@@ -126,57 +164,26 @@ def _products(targets: int, outputs: int, onto: bool = False) -> Any:
             def number(value: int) -> Any:
                 return ir.Constant(integer, value)
 
-            width = number(vectors.lanes)
-            total = [
-                [
-                    [cgutils.alloca_once_value(builder, vectors.zero) for _ in range(4)]
-                    for _ in range(outputs)
-                ]
-                for _ in range(targets)
-            ]
+            total = [[_complex_sum(vectors, split) for _ in range(outputs)] for _ in range(targets)]
             with cgutils.for_range(builder, end, start=begin, intp=integer) as row:
                 at = builder.mul(row.index, number(targets + 1))
-                place = [
-                    builder.load(builder.gep(step_data, [builder.add(at, number(i))]))
-                    for i in range(targets + 1)
-                ]
+                place = [_integer(builder, step_data, at, i) for i in range(targets + 1)]
                 table = builder.add(k_base, place[0])
                 source = [builder.add(m_base, p) for p in place[1:]]
                 with cgutils.for_range(builder, inputs, intp=integer) as column:
                     shift = builder.mul(column.index, number(2 * vectors.lanes))
-                    M_re, M_im = [], []
-                    for g in range(targets):
-                        here = builder.add(source[g], shift)
-                        M_re.append(vectors.load(m_data, here))
-                        M_im.append(vectors.load(m_data, builder.add(here, width)))
+                    M_j = [vectors.load_complex(m_data, builder.add(s, shift)) for s in source]
                     for i in range(outputs):
                         of = builder.add(builder.mul(number(i), inputs), column.index)
                         offset = builder.load(builder.gep(entry_data, [builder.add(e_base, of)]))
-                        here = builder.add(table, offset)
-                        K_re = vectors.load(k_data, here)
-                        K_im = vectors.load(k_data, builder.add(here, width))
+                        K_ij = vectors.load_complex(k_data, builder.add(table, offset))
                         for g in range(targets):
-                            second = 2 if split else 0
-                            terms = (
-                                (vectors.add_product, K_re, M_re[g], 0),
-                                (vectors.add_product, K_re, M_im[g], 1),
-                                (vectors.subtract_product, K_im, M_im[g], second),
-                                (vectors.add_product, K_im, M_re[g], second + 1),
-                            )
-                            for add, a, b, part in terms:
-                                old = builder.load(total[g][i][part])
-                                builder.store(add(a, b, old), total[g][i][part])
+                            _add_complex_product(vectors, K_ij, M_j[g], total[g][i])
             for g in range(targets):
                 row_start = builder.add(l_base, builder.mul(l_stride, number(g)))
                 for i in range(outputs):
-                    for part in range(2):
-                        here = builder.add(row_start, number((2 * i + part) * vectors.lanes))
-                        value = builder.load(total[g][i][part])
-                        if split:
-                            value = vectors.add(value, builder.load(total[g][i][part + 2]))
-                        if onto:
-                            value = vectors.add(value, vectors.load(l_data, here))
-                        vectors.store(value, l_data, here)
+                    here = builder.add(row_start, number(2 * i * vectors.lanes))
+                    _store_complex_sum(vectors, total[g][i], l_data, here, onto)
             return context.get_dummy_value()
 
         return types.void(*arguments), generate
@@ -626,7 +633,7 @@ def _expand(tables, t0, size, lanes, stored, parity, full):
 
     stored : (343,) number in tables, -1 - number of the mirrored vector, or -1000 for none
     """
-    for v in range(343):
+    for v in range(len(stored)):
         at = v * size
         if stored[v] == -1000:
             full[at : at + size] = 0.0
@@ -767,54 +774,72 @@ def translate_families(
             _differences(full, table_size, lanes, rows, products)
             local[l_first : l_first + local_stride] = 0.0
             for w in range(9):
-                children = (2 - min(w // 3, 1)) * (2 - min(w % 3, 1))
-                from_, to = w * 8, 72 + w * 8
-                for p in range(parents):
-                    at = p * in_size
-                    if children == 4:
-                        _gather_4(
-                            spectra, m0, source_children, 8 * p, octants, from_, sources, at,
-                            in_stride, 2 * n_in,
-                        )  # fmt: skip
-                    elif children == 2:
-                        _gather_2(
-                            spectra, m0, source_children, 8 * p, octants, from_, sources, at,
-                            in_stride, 2 * n_in,
-                        )  # fmt: skip
-                    else:
-                        _gather_1(
-                            spectra, m0, source_children, 8 * p, octants, from_, sources, at,
-                            in_stride, 2 * n_in,
-                        )  # fmt: skip
+                _gather_children(
+                    w, spectra, m0, source_children, octants, sources, in_size, in_stride,
+                    lanes,
+                )  # fmt: skip
                 for g in range(groups):
                     for z in range(3):
-                        table, m_z, l_z = (3 * w + z) * product_size, z * in_stride, z * out_stride
-                        if group == GROUP_THREE:
-                            for i in range(0, n_out, 3):
-                                _sums_group_three(
-                                    products, table, sources, m_z, steps, start[g], start[g + 1],
-                                    entry, i * n_in, n_in, sums, l_z + 2 * lanes * i, out_size,
-                                )  # fmt: skip
-                        else:
-                            for i in range(n_out):
-                                _sums_group(
-                                    products, table, sources, m_z, steps, start[g], start[g + 1],
-                                    entry, i * n_in, n_in, sums, l_z + 2 * lanes * i, out_size,
-                                )  # fmt: skip
-                    for k in range(group):
-                        p, at = 8 * (g * group + k), k * out_size
-                        if children == 4:
-                            _spread_4(
-                                local, l_first, target_children, p, octants, to, sums, at,
-                                out_stride, 2 * n_out,
-                            )  # fmt: skip
-                        elif children == 2:
-                            _spread_2(
-                                local, l_first, target_children, p, octants, to, sums, at,
-                                out_stride, 2 * n_out,
-                            )  # fmt: skip
-                        else:
-                            _spread_1(
-                                local, l_first, target_children, p, octants, to, sums, at,
-                                out_stride, 2 * n_out,
-                            )  # fmt: skip
+                        _sum_group(
+                            products, (3 * w + z) * product_size, sources, z * in_stride,
+                            steps, start[g], start[g + 1], group, entry, n_in, n_out,
+                            sums, z * out_stride, out_size, lanes,
+                        )  # fmt: skip
+                    _spread_children(
+                        w, local, l_first, target_children, g * group, group, octants, sums,
+                        out_size, out_stride, lanes,
+                    )  # fmt: skip
+
+
+@jit
+def _pairs_of_children(w):
+    """Pairs of children along z in the products (wx, wy) = (w // 3, w % 3)."""
+    return (2 - min(w // 3, 1)) * (2 - min(w % 3, 1))
+
+
+@jit
+def _gather_children(w, spectra, m0, children, octants, sources, size, stride, lanes):
+    """Sums of children of every source parent that the products with w need, for z = 0, 1, 2."""
+    pairs, order, vectors = _pairs_of_children(w), w * 8, size // lanes
+    for p in range(len(children) // 8):
+        c, at = 8 * p, p * size
+        if pairs == 4:
+            _gather_4(spectra, m0, children, c, octants, order, sources, at, stride, vectors)
+        elif pairs == 2:
+            _gather_2(spectra, m0, children, c, octants, order, sources, at, stride, vectors)
+        else:
+            _gather_1(spectra, m0, children, c, octants, order, sources, at, stride, vectors)
+
+
+@jit
+def _spread_children(w, local, l0, children, first, group, octants, sums, size, stride, lanes):
+    """Add the products with w to the children of the target parents from `first` on."""
+    pairs, order, vectors = _pairs_of_children(w), 72 + w * 8, size // lanes
+    for k in range(group):
+        c, at = 8 * (first + k), k * size
+        if pairs == 4:
+            _spread_4(local, l0, children, c, octants, order, sums, at, stride, vectors)
+        elif pairs == 2:
+            _spread_2(local, l0, children, c, octants, order, sums, at, stride, vectors)
+        else:
+            _spread_1(local, l0, children, c, octants, order, sums, at, stride, vectors)
+
+
+@jit
+def _sum_group(
+    products, table, sources, m0, steps, first, last, group, entry, n_in, n_out, sums, l0, size,
+    lanes,
+):  # fmt: skip
+    """One of the 27 products of a group of target parents, all outputs."""
+    if group == GROUP_THREE:
+        for i in range(0, n_out, 3):
+            _sums_group_three(
+                products, table, sources, m0, steps, first, last,
+                entry, i * n_in, n_in, sums, l0 + 2 * lanes * i, size,
+            )  # fmt: skip
+    else:
+        for i in range(n_out):
+            _sums_group(
+                products, table, sources, m0, steps, first, last,
+                entry, i * n_in, n_in, sums, l0 + 2 * lanes * i, size,
+            )  # fmt: skip

@@ -126,19 +126,9 @@ def coarser(
 
 @jit
 def leaf_rows(
-    level,
-    children,
-    leaf,
-    cell,
-    source_count,
-    wanted,
-    direct_below,
-    colleague_start,
-    colleague,
-    coarse_start,
-    coarse,
-    opened,
-):
+    level, children, leaf, cell, source_count, wanted, direct_below, colleague_start, colleague,
+    coarse_start, coarse, opened,
+):  # fmt: skip
     """Pairs of a target leaf: near_start, near, target_start, target.
 
     Near (U) are the `coarse` leaves and, among the colleagues and all under them, the leaves that
@@ -161,33 +151,36 @@ def leaf_rows(
         for i in range(colleague_start[b], colleague_start[b + 1]):
             s = colleague[i]
             if leaf[s]:
-                near = _with_room(near, near_end, 1)
-                near[near_end] = s
+                near = _appended(near, near_end, s)
                 near_end += 1
                 continue
-            stack[0] = s
-            waiting = 1
+            stack[0], waiting = s, 1
             while waiting > 0:
                 waiting -= 1
                 s = stack[waiting]
                 direct = source_count[s] < direct_below or _touch(level, cell, s, b)
                 if not direct:
-                    target = _with_room(target, target_end, 1)
-                    target[target_end] = s
+                    target = _appended(target, target_end, s)
                     target_end += 1
                 elif leaf[s]:
-                    near = _with_room(near, near_end, 1)
-                    near[near_end] = s
+                    near = _appended(near, near_end, s)
                     near_end += 1
                 else:
                     opened[s] = True
-                    for octant in range(7, -1, -1):
-                        c = children[s, octant]
-                        if c >= 0 and source_count[c] > 0:
-                            stack[waiting] = c
-                            waiting += 1
+                    waiting = _push_children(children, source_count, s, stack, waiting)
     near_start[n], target_start[n] = near_end, target_end
     return near_start, near[:near_end].copy(), target_start, target[:target_end].copy()
+
+
+@jit
+def _push_children(children, source_count, box, stack, waiting):
+    """Put the children with sources on the stack, the first on top; the new number waiting."""
+    for octant in range(7, -1, -1):
+        c = children[box, octant]
+        if c >= 0 and source_count[c] > 0:
+            stack[waiting] = c
+            waiting += 1
+    return waiting
 
 
 @jit
@@ -255,3 +248,11 @@ def _with_room(array, used, extra):
     longer = np.empty(max(2 * len(array), used + extra), array.dtype)
     longer[:used] = array[:used]
     return longer
+
+
+@jit
+def _appended(array, used, value):
+    """The array, or a longer copy, with the value behind its `used` entries."""
+    array = _with_room(array, used, 1)
+    array[used] = value
+    return array

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from stokes.fmm import _lists
 from stokes.fmm.tree import Boxes
 
-VECTORS = 343
-
 
 @dataclass(frozen=True)
 class Pairs:
@@ -110,46 +108,19 @@ def interaction_lists(
     """
     if admissibility not in ("standard", "smooth"):
         raise ValueError(f"admissibility = {admissibility!r}: must be 'standard' or 'smooth'")
-    if wanted is None:
-        wanted = boxes.targets[:, 1] > boxes.targets[:, 0]
-    wanted = np.array(wanted, dtype=bool)
-    _lists.mark_ancestors(boxes.parent, wanted)
+    wanted = _wanted(boxes, wanted)
     cell, opened = boxes.cells(), np.zeros(len(boxes), dtype=bool)
     colleague_start, colleague, *far = _lists.same_level(
-        boxes.parent,
-        boxes.children,
-        boxes.leaf,
-        cell,
-        boxes.source_count,
-        wanted,
-        admissibility == "smooth",
-        far_counted,
-        opened,
+        *(boxes.parent, boxes.children, boxes.leaf, cell, boxes.source_count, wanted),
+        *(admissibility == "smooth", far_counted, opened),
     )
     coarse_start, coarse, *source_to_local = _lists.coarser(
-        boxes.level,
-        boxes.parent,
-        boxes.leaf,
-        cell,
-        boxes.target_count,
-        wanted,
-        direct_below,
-        colleague_start,
-        colleague,
+        *(boxes.level, boxes.parent, boxes.leaf, cell, boxes.target_count, wanted),
+        *(direct_below, colleague_start, colleague),
     )
     near_start, near, *multipole_to_target = _lists.leaf_rows(
-        boxes.level,
-        boxes.children,
-        boxes.leaf,
-        cell,
-        boxes.source_count,
-        wanted,
-        direct_below,
-        colleague_start,
-        colleague,
-        coarse_start,
-        coarse,
-        opened,
+        *(boxes.level, boxes.children, boxes.leaf, cell, boxes.source_count, wanted),
+        *(direct_below, colleague_start, colleague, coarse_start, coarse, opened),
     )
     lists = Lists(
         near=Pairs(near_start, near),
@@ -172,6 +143,15 @@ def point_ranges(
     rows = pairs.rows()
     start, sources = _lists.merged_ranges(rows, pairs.start, pairs.source, boxes.sources)
     return boxes.targets[rows], start, sources
+
+
+def _wanted(boxes: Boxes, wanted: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    """The wanted boxes (nb,), or those with targets, and their ancestors: a copy."""
+    if wanted is None:
+        wanted = boxes.targets[:, 1] > boxes.targets[:, 0]
+    marked = np.array(wanted, dtype=bool)
+    _lists.mark_ancestors(boxes.parent, marked)
+    return marked
 
 
 def _check_complete(boxes: Boxes, lists: Lists, opened: NDArray[np.bool_]) -> None:
