@@ -34,7 +34,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -45,6 +44,8 @@ from stokes.fmm._kernels_chebyshev import (
     scatter_rows,
     scatter_turned,
 )
+from stokes.fmm._transfer_levels import is_smooth, levels_with_tables
+from stokes.fmm.interpolation import Grid
 from stokes.fmm.kernels import Kernel
 from stokes.fmm.low_rank import LowRank, approximate, common_range, recompressed
 from stokes.fmm.symmetry import VECTORS, Orbits, orbits, transfer_vectors, vector_offset
@@ -53,23 +54,13 @@ from stokes.fmm.symmetry import VECTORS, Orbits, orbits, transfer_vectors, vecto
 _PAIRS = 512
 # Entries of a kernel matrix evaluated at once while operators are built.
 _ENTRIES = 1 << 18
-# Below the coarsest level of a standard tree with two boxes apart enough (4 boxes per edge).
-_FIRST_FAR_LEVEL = 2
-
-
-class Nodes(Protocol):
-    """What is used of a grid: its kind, nodes per direction and their places in [-1, 1]."""
-
-    kind: str
-    nodes: int
-    points: np.ndarray
 
 
 class MatrixTransfer(ABC):
     """What the three transfers share: levels, the ordering of pairs, threads.
 
     kernel        homogeneous kernels have one table, others one a level
-    grid          Nodes
+    grid          the same in each direction, symmetric about the centre of the box
     edges         (levels,) edge of a box at each level, root first
     admissibility "standard", or "smooth": boxes of the last level reach their neighbours too
     dtype         of tables, multipoles and locals
@@ -78,15 +69,14 @@ class MatrixTransfer(ABC):
     def __init__(
         self,
         kernel: Kernel,
-        grid: Nodes,
+        grid: Grid,
         edges: Sequence[float],
         *,
         admissibility: str = "standard",
         dtype: DTypeLike = np.float64,
         threads: int = 1,
     ) -> None:
-        if admissibility not in ("standard", "smooth"):
-            raise ValueError(f"admissibility = {admissibility!r}: must be standard or smooth")
+        smooth = is_smooth(admissibility)
         self.kernel = kernel
         self.nodes = grid.nodes
         self.dtype = np.dtype(dtype)
@@ -103,7 +93,7 @@ class MatrixTransfer(ABC):
             level: self._build(
                 _Family(kernel, grid, edge, transfer_vectors(neighbours), self._orbits)
             )
-            for level, edge, neighbours in self._levels(admissibility == "smooth")
+            for level, edge, neighbours in levels_with_tables(kernel, self._edges, smooth)
         }
 
     @property
@@ -143,7 +133,7 @@ class MatrixTransfer(ABC):
         vector: np.ndarray,
         targets: np.ndarray,
         cells: np.ndarray | None = None,
-    ) -> Pairs:
+    ) -> OrderedPairs:
         """Order the pairs of a level (arguments of `add`) for any number of calls of `apply`.
 
         `cells` is of no use here: every pair is taken by itself.
@@ -156,9 +146,9 @@ class MatrixTransfer(ABC):
             for a, b in pairwise(cuts)
             if start[a] < start[b]
         )
-        return Pairs(level, parts)
+        return OrderedPairs(level, parts)
 
-    def apply(self, pairs: Pairs, multipoles: np.ndarray, local: np.ndarray) -> None:
+    def apply(self, pairs: OrderedPairs, multipoles: np.ndarray, local: np.ndarray) -> None:
         """Add to the locals what the multipoles give them over the prepared pairs of a level."""
         if not pairs.parts:
             return
@@ -174,19 +164,6 @@ class MatrixTransfer(ABC):
     def _operator_of(self) -> np.ndarray:
         """(343,) The vector of the operator that each vector's pairs are multiplied with."""
         return np.arange(VECTORS)
-
-    def _levels(self, smooth: bool) -> Iterator[tuple[int, float, bool]]:
-        """Levels with tables of their own: (level, edge, whether neighbours are among them)."""
-        last = len(self._edges) - 1
-        if last < (0 if smooth else _FIRST_FAR_LEVEL):
-            return
-        if self.kernel.degree is not None:
-            yield 0, 1.0, smooth
-            return
-        for level in range(_FIRST_FAR_LEVEL, last + 1):
-            yield level, self._edges[level], smooth and level == last
-        if smooth and last < _FIRST_FAR_LEVEL:
-            yield last, self._edges[last], True
 
     def _table(self, level: int) -> tuple[_Table, float]:
         if self.kernel.degree is None:
@@ -253,7 +230,7 @@ class CompressedTransfer(MatrixTransfer):
     def __init__(
         self,
         kernel: Kernel,
-        grid: Nodes,
+        grid: Grid,
         edges: Sequence[float],
         eps: float,
         **options: object,
@@ -335,7 +312,7 @@ class SymmetricTransfer(MatrixTransfer):
     def __init__(
         self,
         kernel: Kernel,
-        grid: Nodes,
+        grid: Grid,
         edges: Sequence[float],
         eps: float,
         **options: object,
@@ -424,7 +401,7 @@ class _Table:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class OrderedPairs:
     """The pairs of boxes of one level, ordered by operator; a part for each thread."""
 
     level: int
@@ -478,7 +455,7 @@ class _Family:
     """
 
     def __init__(
-        self, kernel: Kernel, grid: Nodes, edge: float, vectors: np.ndarray, turns: Orbits
+        self, kernel: Kernel, grid: Grid, edge: float, vectors: np.ndarray, turns: Orbits
     ) -> None:
         self.vectors = vectors
         self.shape = (kernel.n_out * grid.nodes**3, kernel.n_in * grid.nodes**3)
@@ -554,7 +531,7 @@ class _Family:
         return self._edge * vector_offset(v)
 
 
-def _root_weights(grid: Nodes) -> np.ndarray:
+def _root_weights(grid: Grid) -> np.ndarray:
     """Square roots of the quadrature weights of all nodes (N,), of mean square 1."""
     if grid.kind != "chebyshev":
         return np.ones(grid.nodes**3)

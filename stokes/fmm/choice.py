@@ -27,6 +27,7 @@ from stokes.fmm.close_pairs import close_distance
 from stokes.fmm.kernels import KERNELS, Kernel
 from stokes.fmm.lists import Pairs, interaction_lists
 from stokes.fmm.options import FmmOptions, Near
+from stokes.fmm.symmetry import VECTORS
 from stokes.fmm.tree import Boxes, Splitting, build, corners, cube_about
 from stokes.fmm.tree_sum import Scheme, grid_of, single_pairs
 
@@ -425,7 +426,7 @@ class Cost:
     def smooth(self, depth: int, points: int) -> float:
         """Nanoseconds of a full uniform tree whose leaves have all 343 transfers."""
         boxes = 8.0**depth
-        return (343.0 * self.transfer + 1.15 * self.passes) * boxes + self.points * points
+        return (VECTORS * self.transfer + 1.15 * self.passes) * boxes + self.points * points
 
 
 def _point_pairs(pairs: Pairs, of_target: NDArray, of_source: NDArray) -> float:

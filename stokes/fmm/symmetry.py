@@ -20,6 +20,7 @@ import numpy as np
 # Kernel.rotate: Q (3, 3) -> R_out (n_out, n_out), R_in (n_in, n_in), signed permutations.
 Rotation = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
+# Transfer vectors: of all boxes whose parents touch, offsets in -3..3 in each direction.
 VECTORS = 343
 
 

@@ -19,18 +19,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from stokes.fmm import _kernels_transfer as kernels
+from stokes.fmm._transfer_levels import is_smooth, levels_with_tables
+from stokes.fmm.interpolation import Grid
 from stokes.fmm.kernels import Kernel
+from stokes.fmm.symmetry import VECTORS, vector_index, vector_offset
 from stokes.fmm.windows import windows
 
-_VECTORS = 343
-# Below the coarsest level of a standard tree with two boxes apart enough (4 boxes per edge).
-_FIRST_FAR_LEVEL = 2
 # Cost of a product in the loop over pairs against one in the loop over families: for scalar
 # kernels the former waits for its additions, for others both wait for the cache.
 _PAIR_COST, _PAIR_COST_SCALAR = 1.3, 2.2
@@ -42,14 +42,6 @@ _SPECTRA_BYTES = 1 << 28
 _SWEEPS = 8
 # Nodes from which on each kz fills whole blocks, so that no turn computes one in part.
 _WHOLE_TURNS = 8
-
-
-class Nodes(Protocol):
-    """What is used of a grid: its kind, nodes per direction, and its size in that of the box."""
-
-    kind: str
-    nodes: int
-    extent: float
 
 
 class FourierTransfer:
@@ -66,7 +58,7 @@ class FourierTransfer:
     def __init__(
         self,
         kernel: Kernel,
-        grid: Nodes,
+        grid: Grid,
         edges: Sequence[float],
         *,
         admissibility: str = "standard",
@@ -74,8 +66,7 @@ class FourierTransfer:
         threads: int = 1,
         memory: int = _SPECTRA_BYTES,
     ) -> None:
-        if admissibility not in ("standard", "smooth"):
-            raise ValueError(f"admissibility = {admissibility!r}: must be standard or smooth")
+        smooth = is_smooth(admissibility)
         if grid.kind != "equispaced":
             raise ValueError(f"grid {grid.kind!r}: Fourier transfers need an equispaced grid")
         if grid.nodes < 2:
@@ -88,13 +79,12 @@ class FourierTransfer:
         self._memory = memory
         self._lanes = kernels.VECTOR_BYTES // self.dtype.itemsize
         self._edges = np.asarray(edges, dtype=np.float64)
-        self._smooth = admissibility == "smooth"
         self._work = np.empty(0, self.dtype)
         self._frequencies = _Frequencies(self.nodes, self._lanes)
-        self._stored = _stored_vectors(self._smooth, kernel.parity != 0)
+        self._stored = _stored_vectors(smooth, kernel.parity != 0)
         self._tables = {
             level: self._build(edge)
-            for level, edge in _levels_with_tables(kernel, self._edges, self._smooth)
+            for level, edge, _ in levels_with_tables(kernel, self._edges, smooth)
         }
         number = np.asarray(kernel.entry, dtype=np.int64).reshape(-1)
         self._entry = number * 2 * self._lanes
@@ -138,14 +128,14 @@ class FourierTransfer:
         vector: NDArray,
         targets: NDArray,
         cells: NDArray | None = None,
-    ) -> Pairs:
+    ) -> OrderedPairs:
         """Order the pairs of a level (arguments of `add`) for any number of calls of `apply`."""
         start = np.asarray(start, dtype=np.int64)
         busy = np.flatnonzero(np.diff(start) > 0)
         targets = np.asarray(targets)[busy]
         if len(targets) == 0:
             none = np.empty(0, dtype=np.int64)
-            return Pairs(level, none, targets, none, none, none, none, None)
+            return OrderedPairs(level, none, targets, none, none, none, none, None)
         source, vector = (np.asarray(a[start[0] : start[-1]]) for a in (source, vector))
         rank = np.zeros(source.max() + 1, dtype=np.int64)
         rank[source] = 1
@@ -155,7 +145,7 @@ class FourierTransfer:
             families = self._families(np.asarray(cells), sources, targets, vector)
         if families is not None:
             none = np.empty(0, dtype=np.int64)
-            return Pairs(level, sources, targets, none, none, none, none, families)
+            return OrderedPairs(level, sources, targets, none, none, none, none, families)
         rank[sources] = np.arange(len(sources))
         bounds = np.append(start[busy], start[-1]) - start[0]
         target = np.repeat(np.arange(len(targets)), np.diff(bounds))
@@ -167,7 +157,7 @@ class FourierTransfer:
             run = cluster[order].astype(np.int64) * len(targets) + target[order]
             first = np.append(np.flatnonzero(np.diff(run, prepend=-1)), len(run))
         place, vector, target = rank[source[order]], vector[order], target[order][first[:-1]]
-        return Pairs(level, sources, targets, first, target, place, vector, None)
+        return OrderedPairs(level, sources, targets, first, target, place, vector, None)
 
     def _families(
         self, cells: NDArray, sources: NDArray, targets: NDArray, vector: NDArray
@@ -182,7 +172,7 @@ class FourierTransfer:
             return None
         return families
 
-    def apply(self, pairs: Pairs, multipoles: NDArray, local: NDArray) -> None:
+    def apply(self, pairs: OrderedPairs, multipoles: NDArray, local: NDArray) -> None:
         """Add to the locals what the prepared pairs of a level give: see `add`."""
         if len(pairs.targets) == 0:
             return
@@ -205,7 +195,21 @@ class FourierTransfer:
             self._translate(pairs, table, first, last, M, spectra, L, result)
             some.backward(L, result, scale, local, self.threads)
 
-    def _translate(self, pairs, table, first, last, M, spectra, L, result):
+    def _translate(
+        self,
+        pairs: OrderedPairs,
+        table: NDArray,
+        first: int,
+        last: int,
+        M: NDArray,
+        spectra: _Rows,
+        L: NDArray,
+        result: _Rows,
+    ) -> None:
+        """Spectra L of the locals from those of the multipoles, M, in the blocks first : last.
+
+        M, L : flat [block][row][re, im][lanes] of the rows of spectra, of result
+        """
         lanes, kernel = self._lanes, self.kernel
         size = kernel.n_unique * 2 * lanes
         stride = table.size // self._frequencies.blocks
@@ -217,7 +221,7 @@ class FourierTransfer:
                 pairs.families, common, last - first, M, M_stride, spectra, L, L_stride, result
             )
             return
-        full = _aligned_rows(workers, _VECTORS * size, self.dtype)
+        full = _aligned_rows(workers, VECTORS * size, self.dtype)
         in_size, out_size = kernel.n_in * 2 * lanes, kernel.n_out * 2 * lanes
         steps = np.stack([pairs.vector * size, pairs.place * in_size], 1).reshape(-1)
         kernels.translate_pairs.using(self.threads)(
@@ -226,22 +230,35 @@ class FourierTransfer:
         )  # fmt: skip
 
     def _translate_families(
-        self, families, common, blocks, M, M_stride, spectra, L, L_stride, result
-    ):
+        self,
+        families: _Families,
+        common: tuple[Any, ...],
+        blocks: int,
+        M: NDArray,
+        M_stride: int,
+        spectra: _Rows,
+        L: NDArray,
+        L_stride: int,
+        result: _Rows,
+    ) -> None:
+        """As `_translate`, by families.
+
+        common : tables, numbers in a block of them and in a vector's, lanes, stored, parity
+        M_stride, L_stride : numbers in a block
+        """
         lanes, kernel = self._lanes, self.kernel
         size, group = kernel.n_unique * 2 * lanes, families.group
         in_size, out_size = kernel.n_in * 2 * lanes, kernel.n_out * 2 * lanes
         parents = len(families.source_children)
         sizes = [
-            _VECTORS * size,
+            VECTORS * size,
             27 * len(families.directions) * size,
             3 * (parents + 1) * in_size,
             3 * group * out_size,
         ]
         places = np.concatenate([[0], np.cumsum(sizes)])
         work = _aligned_rows(max(1, min(self.threads, blocks)), places[-1], self.dtype)
-        vectors = 2 * families.directions[:, None] + _BLOCK + 3
-        rows = (vectors @ np.array([49, 7, 1])) * size
+        rows = vector_index(2 * families.directions[:, None] + _BLOCK) * size
         steps = families.steps * np.array([size] + group * [in_size])
         stored = self._stored if families.neighbours else np.where(_NEAR, -1000, self._stored)
         # Offsets of the children in a block; missing ones are the box of zeros.
@@ -287,7 +304,7 @@ class FourierTransfer:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class OrderedPairs:
     """Pairs of one level in the order of the loops over them.
 
     sources, targets : boxes that occur. Then either, by families of siblings, where it pays,
@@ -324,7 +341,7 @@ class _Families:
     products: int
 
 
-_OFFSETS = np.stack(np.meshgrid(*3 * [np.arange(-3, 4)], indexing="ij"), -1).reshape(-1, 3)
+_OFFSETS = vector_offset(np.arange(VECTORS))
 _BLOCK = np.stack(np.meshgrid(*3 * [np.arange(-1, 2)], indexing="ij"), -1).reshape(-1, 3)
 _NEAR = np.abs(_OFFSETS).max(axis=1) <= 1
 # Which of the 27 regions before, about and behind the target in each direction a source is in.
@@ -398,8 +415,18 @@ def _parents(cells: NDArray, lowest: NDArray) -> tuple[NDArray, NDArray]:
     return codes[order], children
 
 
-def _count(source_children, target_children, neighbour, directions, neighbours) -> int:
-    """Pairs of children far enough apart, or of all of them."""
+def _count(
+    source_children: NDArray,
+    target_children: NDArray,
+    neighbour: NDArray,
+    directions: NDArray,
+    neighbours: bool,
+) -> int:
+    """Pairs of children far enough apart, or of all of them with `neighbours`.
+
+    source_children, target_children : (parents, 8) of boxes, -1 for none
+    neighbour : (target parents, k) source parent, their number for none, by directions (k, 3)
+    """
     bits = np.array([[o >> 2 & 1, o >> 1 & 1, o & 1] for o in range(8)])
     d = 2 * directions[:, None, None] + bits[:, None] - bits
     far = np.ones(d.shape[:-1], dtype=bool) if neighbours else np.abs(d).max(axis=-1) > 1
@@ -410,27 +437,14 @@ def _count(source_children, target_children, neighbour, directions, neighbours) 
     return total
 
 
-def _levels_with_tables(kernel: Kernel, edges: NDArray, smooth: bool):
-    """(level, edge) of the tables: one of a unit box for homogeneous kernels."""
-    last = len(edges) - 1
-    first = min(_FIRST_FAR_LEVEL, last) if smooth else _FIRST_FAR_LEVEL
-    if last < first:
-        return
-    if kernel.degree is not None:
-        yield 0, 1.0
-        return
-    for level in range(first, last + 1):
-        yield level, edges[level]
-
-
 def _stored_vectors(smooth: bool, mirrored: bool) -> NDArray:
     """Number of each vector's table; -1 - number where it is the mirrored one's; -1000 if none."""
-    stored = np.full(_VECTORS, -1000, dtype=np.int64)
+    stored = np.full(VECTORS, -1000, dtype=np.int64)
     count = 0
-    for v in range(_VECTORS):
+    for v in range(VECTORS):
         if _NEAR[v] and not smooth:
             continue
-        opposite = _VECTORS - 1 - v
+        opposite = VECTORS - 1 - v
         if mirrored and opposite < v:
             stored[v] = -1 - stored[opposite]
         else:
@@ -439,7 +453,7 @@ def _stored_vectors(smooth: bool, mirrored: bool) -> NDArray:
     return stored
 
 
-def _differences(grid: Nodes, edge: float, vectors: NDArray) -> NDArray[np.float64]:
+def _differences(grid: Grid, edge: float, vectors: NDArray) -> NDArray[np.float64]:
     """Differences of the nodes of two boxes for each vector: (vectors, 3, 2 nodes - 1)."""
     difference = grid.extent * edge * np.linspace(-1.0, 1.0, 2 * grid.nodes - 1)
     return difference + edge * _OFFSETS[vectors][:, :, None]

@@ -7,13 +7,13 @@ transforms of orthogonal columns), 1e-6 in single precision, unless said otherwi
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 from numba.extending import register_jitable
 
 from stokes.fmm import transfer as module
+from stokes.fmm.interpolation import Grid
 from stokes.fmm.kernels import Kernel, gaussian, laplace, stokeslet
 from stokes.fmm.transfer import FourierTransfer
 
@@ -21,15 +21,8 @@ EDGES = (0.6, 0.3, 0.15, 0.075)
 TOLERANCE = {"float64": 1e-13, "float32": 1e-6}
 
 
-@dataclass(frozen=True)
-class Equispaced:
-    nodes: int
-    kind: str = "equispaced"
-    extent: float = 1.0
-
-    @property
-    def points(self) -> np.ndarray:
-        return self.extent * np.linspace(-1.0, 1.0, self.nodes)
+def equispaced(nodes: int, extent: float = 1.0) -> Grid:
+    return Grid("equispaced", nodes, extent)
 
 
 @register_jitable
@@ -107,7 +100,7 @@ def transferred(
     kernel, nodes, level, pairs, multipoles, *, cells=None, dtype="float64", extent=1.0, **options
 ):
     """Locals of all boxes by the transfer under test."""
-    grid = Equispaced(nodes, extent=extent)
+    grid = equispaced(nodes, extent=extent)
     transfer = FourierTransfer(kernel, grid, EDGES, dtype=dtype, **options)
     boxes = len(multipoles)
     local = np.zeros((boxes, kernel.n_out, nodes, nodes, nodes), dtype)
@@ -195,10 +188,10 @@ def test_a_homogeneous_kernel_has_one_table_and_scales_with_the_edge():
     fine = transferred(stokeslet, nodes, 3, pairs, multipoles)
     # The edge halves: the kernel of degree -1 doubles, to the last bit as the factor is 2.
     np.testing.assert_array_equal(fine, 2.0 * coarse)
-    one = FourierTransfer(stokeslet, Equispaced(nodes), EDGES[:3]).bytes
-    assert FourierTransfer(stokeslet, Equispaced(nodes), EDGES).bytes == one
-    per_level = FourierTransfer(lopsided, Equispaced(nodes), EDGES[:3]).bytes
-    assert FourierTransfer(lopsided, Equispaced(nodes), EDGES).bytes == 2 * per_level
+    one = FourierTransfer(stokeslet, equispaced(nodes), EDGES[:3]).bytes
+    assert FourierTransfer(stokeslet, equispaced(nodes), EDGES).bytes == one
+    per_level = FourierTransfer(lopsided, equispaced(nodes), EDGES[:3]).bytes
+    assert FourierTransfer(lopsided, equispaced(nodes), EDGES).bytes == 2 * per_level
 
 
 def test_boxes_scattered_over_a_surface(families):
@@ -238,7 +231,7 @@ def test_parts_of_the_targets_give_the_same(families):
     start, source, vector = far_pairs(cells)
     multipoles = random_multipoles(laplace, 4, len(cells))
     chosen = cells if families else None
-    transfer = FourierTransfer(laplace, Equispaced(4), EDGES)
+    transfer = FourierTransfer(laplace, equispaced(4), EDGES)
     whole, parts = (np.zeros((len(cells), 1, 4, 4, 4)) for _ in range(2))
     boxes = np.arange(len(cells))
     transfer.add(3, multipoles, start, source, vector, boxes, whole, chosen)
@@ -249,7 +242,7 @@ def test_parts_of_the_targets_give_the_same(families):
 
 
 def test_families_are_taken_where_they_are_full():
-    transfer = FourierTransfer(stokeslet, Equispaced(3), EDGES)
+    transfer = FourierTransfer(stokeslet, equispaced(3), EDGES)
     cells = cube_cells(8)
     full = transfer.prepare(3, *far_pairs(cells), np.arange(len(cells)), cells)
     assert full.families is not None
@@ -266,7 +259,7 @@ def test_pairs_that_are_not_all_between_two_families_are_taken_one_by_one():
     kept[start[20]] = False
     count = np.concatenate([[0], np.cumsum(kept)])
     pairs = count[start], source[kept], vector[kept]
-    transfer = FourierTransfer(laplace, Equispaced(3), EDGES)
+    transfer = FourierTransfer(laplace, equispaced(3), EDGES)
     prepared = transfer.prepare(3, *pairs, np.arange(len(cells)), cells)
     assert prepared.families is None
     multipoles, local = random_multipoles(laplace, 3, 216), np.zeros((216, 1, 3, 3, 3))
@@ -278,7 +271,7 @@ def test_pairs_that_are_not_all_between_two_families_are_taken_one_by_one():
 def test_locals_are_added_to_and_prepared_pairs_can_be_used_again():
     cells = cube_cells(4)
     pairs, multipoles = far_pairs(cells), random_multipoles(laplace, 3, 64)
-    transfer = FourierTransfer(laplace, Equispaced(3), EDGES)
+    transfer = FourierTransfer(laplace, equispaced(3), EDGES)
     prepared = transfer.prepare(2, *pairs, np.arange(64), cells)
     local = np.zeros((64, 1, 3, 3, 3))
     transfer.apply(prepared, multipoles, local)
@@ -296,13 +289,13 @@ def test_grids_shorter_and_longer_than_the_box(extent):
 
 
 def test_nothing_to_transfer():
-    transfer = FourierTransfer(stokeslet, Equispaced(3), EDGES)
+    transfer = FourierTransfer(stokeslet, equispaced(3), EDGES)
     none = np.empty(0, dtype=np.int64)
     for boxes in (0, 1):
         local = np.zeros((boxes, 3, 3, 3, 3))
         transfer.add(2, local, np.zeros(boxes + 1, int), none, none, np.arange(boxes), local)
         assert not local.any()
-    assert FourierTransfer(stokeslet, Equispaced(3), EDGES[:1]).bytes == 0
+    assert FourierTransfer(stokeslet, equispaced(3), EDGES[:1]).bytes == 0
 
 
 def test_one_pair():
@@ -315,9 +308,9 @@ def test_one_pair():
 @pytest.mark.parametrize(
     ("grid", "options", "message"),
     [
-        (Equispaced(4, kind="chebyshev"), {}, "equispaced"),
-        (Equispaced(1), {}, "nodes = 1"),
-        (Equispaced(4), {"admissibility": "weak"}, "admissibility"),
+        (Grid("chebyshev", 4), {}, "equispaced"),
+        (equispaced(1), {}, "nodes = 1"),
+        (equispaced(4), {"admissibility": "weak"}, "admissibility"),
     ],
 )
 def test_senseless_requests_are_refused(grid, options, message):
@@ -326,7 +319,7 @@ def test_senseless_requests_are_refused(grid, options, message):
 
 
 def test_arrays_of_another_precision_are_refused():
-    transfer = FourierTransfer(laplace, Equispaced(2), EDGES, dtype=np.float32)
+    transfer = FourierTransfer(laplace, equispaced(2), EDGES, dtype=np.float32)
     pairs = np.array([0, 1]), np.array([0]), np.array([0])
     array = np.zeros((1, 1, 2, 2, 2))
     with pytest.raises(TypeError, match="float32"):
