@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from dem_mpi._jit import ThreadedKernel
 from stokes.fmm import _kernels_interpolation as kernels
 
 if TYPE_CHECKING:
@@ -209,10 +210,7 @@ class Interpolator:
         own: NDArray[np.bool_] | None = None,
     ) -> None:
         """Add the moments of level + 1 to their parents, on `level` (B eq. 1.18)."""
-        parents = self._parents(boxes, level, own)
-        moments = self._flat(multipoles)
-        kernel = kernels.m2m.using(self.threads)
-        kernel(parents, boxes.children, self._to_parent, moments)
+        self._between(kernels.m2m, self._to_parent, boxes, level, multipoles, own)
 
     def l2l(
         self,
@@ -223,10 +221,7 @@ class Interpolator:
         own: NDArray[np.bool_] | None = None,
     ) -> None:
         """Add the local expansions of `level` to their children, on level + 1 (B eq. 1.20)."""
-        parents = self._parents(boxes, level, own)
-        moments = self._flat(locals_)
-        kernel = kernels.l2l.using(self.threads)
-        kernel(parents, boxes.children, self._to_child, moments)
+        self._between(kernels.l2l, self._to_child, boxes, level, locals_, own)
 
     def evaluate(
         self,
@@ -247,6 +242,19 @@ class Interpolator:
         for level in range(boxes.depth):
             self.l2l(boxes, level, locals_, own=own)
         self.l2p(boxes, x, locals_, out, root_edge, origin=origin, own=own, gradient=gradient)
+
+    def _between(
+        self,
+        kernel: ThreadedKernel,
+        matrices: NDArray,
+        boxes: Boxes,
+        level: int,
+        moments: NDArray,
+        own: NDArray[np.bool_] | None,
+    ) -> None:
+        """Add between the boxes of `level` and their children, by `matrices` (2, nodes, nodes)."""
+        parents = self._parents(boxes, level, own)
+        kernel.using(self.threads)(parents, boxes.children, matrices, self._flat(moments))
 
     def _leaves(self, boxes: Boxes, ranges: NDArray, frame: tuple, own: NDArray | None) -> tuple:
         """Arguments of the loops over leaves: those with points, ranges, geometry, polynomials."""
