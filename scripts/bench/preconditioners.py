@@ -21,12 +21,14 @@ import json
 import math
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from lib import piles
 from lib.preconditioner_work import CANDIDATES, EXACT, Trial, measure, missing
-from records import BUILD, Record, arguments, commit, mpirun, write
+from records import BUILD, Record, arguments, mpirun, write
+from scip import checked_out
 
 # Newton iterations at which candidates are tried, from 1: early, middle, late.
 CHOSEN = {"pile-2000/settled": (3, 7, 12), "pile-16000/settled": (4, 11, 18)}
@@ -97,7 +99,7 @@ def _trial_records(one: Trial, exact: Trial, where: dict[str, Any]) -> list[Reco
         iterations, seconds, rival = one.iterations[k], one.seconds[k], exact.seconds[k]
         asked = params | {"tolerance": tolerance}
         if iterations is None or seconds is None:
-            asked["failure"] = "not reached"
+            asked["failure"] = "not positive definite" if one.broken else "not reached"
             records.append(Record("preconditioners.iterations", asked, one.spent, "1"))
             continue
         records.append(Record("preconditioners.iterations", asked, iterations, "1"))
@@ -114,7 +116,7 @@ def _trial_records(one: Trial, exact: Trial, where: dict[str, Any]) -> list[Reco
 
 def tables(found: Found) -> str:
     """A table a pile: a row a candidate, two columns an iteration."""
-    return "\n\n".join([f"Commit {commit()}.", *(_table(solve) for solve in found.values())])
+    return "\n\n".join([f"Commit {checked_out()}.", *(_table(solve) for solve in found.values())])
 
 
 def _table(solve: dict[str, Any]) -> str:
@@ -150,7 +152,7 @@ def _cell(one: Trial, k: int) -> str:
     """Iterations / seconds of conjugate gradients to a tolerance."""
     iterations, seconds = one.iterations[k], one.seconds[k]
     if iterations is None or seconds is None:
-        return f"> {one.spent:,}"
+        return "breaks down" if one.broken else f"> {one.spent:,}"
     return f"{iterations:,} / {_number(seconds)}"
 
 
@@ -218,7 +220,8 @@ def main() -> None:
     parser.add_argument("--page", type=Path, help="put the tables into this Markdown file")
     options = parser.parse_args()
     found = {state: run(state) for state in (QUICK if options.quick else CHOSEN)}
-    write(records_of(found), options.json)
+    records = [replace(record, commit=checked_out()) for record in records_of(found)]
+    write(records, options.json)
     if options.page:
         put(tables(found), options.page)
     if options.figure:

@@ -89,6 +89,8 @@ class Trial:
     set_up     : of another one with the pattern known, as in every later iteration of a solve
     iterations, seconds : of conjugate gradients to each tolerance, None where not reached
     spent      : iterations when it ended
+    broken     : it ended because the preconditioner, by rounding or what it drops, is not positive
+                 definite
     entries    : of the factor; None where there is none
     """
 
@@ -98,6 +100,7 @@ class Trial:
     iterations: list[int | None]
     seconds: list[float | None]
     spent: int
+    broken: bool
     entries: int | None
 
 
@@ -293,14 +296,16 @@ def trial(
         set_up = _cpu_seconds(lambda: _set_up(ksp))
         if candidate.factor == "earlier":
             set_up = 0.0  # it is there already
-        iterations, seconds, spent = _iterate(ksp, b, x, goals, PETSc)
+        iterations, seconds = _iterate(ksp, b, x, goals, PETSc)
+        spent = ksp.getIterationNumber()
+        broken = ksp.getConvergedReason() == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC
         entries = _entries(ksp.getPC(), candidate)
     finally:
         for key in options:
             database.delValue(key)
         ksp.destroy()
         x.destroy()
-    return Trial(candidate.name, first, set_up, iterations, seconds, spent, entries)
+    return Trial(candidate.name, first, set_up, iterations, seconds, spent, broken, entries)
 
 
 def _choose_mumps(pc: Any, candidate: Candidate, block: int, petsc: Any) -> None:
@@ -337,10 +342,10 @@ def _cpu_seconds(work: Callable[[], None]) -> float:
 
 def _iterate(
     ksp: Any, b: Any, x: Any, goals: Sequence[float], petsc: Any
-) -> tuple[list[int | None], list[float | None], int]:
+) -> tuple[list[int | None], list[float | None]]:
     """Iterate from zero until the last of the falling goals |b - K x|, or a limit, is reached.
 
-    Returns iterations and CPU seconds to each goal, and iterations in all.
+    Returns iterations and CPU seconds to each goal.
     """
     reason = petsc.KSP.ConvergedReason
     iterations: list[int | None] = [None] * len(goals)
@@ -362,7 +367,7 @@ def _iterate(
     ksp.setTolerances(max_it=MAX_ITERATIONS)
     ksp.setConvergenceTest(watch)
     ksp.solve(b, x)
-    return iterations, seconds, ksp.getIterationNumber()
+    return iterations, seconds
 
 
 def _entries(pc: Any, candidate: Candidate) -> int | None:
