@@ -73,7 +73,8 @@ def warm_up(
 
     kinds : SPHERES, GENERAL or both; a scene with any body that is not a sphere is GENERAL.
     solvers, law, form : as in the contact section of a scene; nothing else is compiled, and PETSc
-    is not even imported where neither operators nor solvers need it.
+    is not even imported where neither operators nor Newton's method, of an interior point or of
+    Coulomb's law, need it.
     Returns how many variants of kernels this rank compiled, having found them in no cache.
     """
     called = [
@@ -81,7 +82,8 @@ def warm_up(
         for solver in sorted({each for asked in solvers for each in _SOLVERS[asked]})
         for shape in (_FORMS[form] if solver == "scip" else ("auto",))
     ]
-    if "assembled" in operators or any(solver == "scip" for solver, _ in called):
+    newton = law == "coulomb" or any(solver == "scip" for solver, _ in called)
+    if newton or "assembled" in operators:
         # PETSc starts on all ranks together: one that came alone would wait for the others.
         import petsc4py.PETSc  # noqa: F401
     error = None
