@@ -1,7 +1,7 @@
 """Fast sums: ours beside FMM3D and the direct sum, at equal measured error; grids beside grids.
 
     python scripts/bench/fmm.py [--quick] [--json FILE] [--figure FILE] [--only PART ...]
-        [--page FILE]
+        [--page FILE] [--dry] [--version VERSION]
 
 FMM3D (Z. Gimbutas, L. Greengard et al.) is the Fortran library one would take for Laplace and
 Stokes: it is measured where the Python package fmm3dpy is found. To be a fair rival it has to be
@@ -67,6 +67,8 @@ def measure(ranks: int = 1, limit: float = 900.0, **task: Any) -> dict[str, Any]
     version = "rival" if task["method"] == "fmm3d" else own_version()
     path = CACHE / version / f"{_safe(name)}-{ranks}.json"
     if not path.exists():
+        if "dry" in _ASKED:
+            return None
         path.parent.mkdir(parents=True, exist_ok=True)
         order, result = (path.with_suffix(f".{kind}-{os.getpid()}") for kind in ("task", "result"))
         order.write_text(json.dumps(task))
@@ -103,12 +105,13 @@ def _start(method: str, ranks: int, command: list[str], limit: float) -> None:
     subprocess.run(call, check=True, env=environment, cwd=ROOT, timeout=limit)
 
 
-_VERSION: dict[str, str] = {}
+# What the command line says of all cases: "version" to look results up by, "dry" to measure none.
+_ASKED: dict[str, str] = {}
 
 
 def own_version() -> str:
     """The commit in which the package was last changed, + and a digest if it differs from it."""
-    if "fmm" not in _VERSION:
+    if "version" not in _ASKED:
 
         def git(*command: str) -> str:
             call = ["git", "-C", str(ROOT), *command, "--", "stokes/fmm"]
@@ -116,12 +119,14 @@ def own_version() -> str:
 
         changes = git("diff", "HEAD")
         mark = "+" + sha1(changes.encode()).hexdigest()[:6] if changes else ""
-        _VERSION["fmm"] = git("log", "-1", "--format=%h") + mark
-    return _VERSION["fmm"]
+        _ASKED["version"] = git("log", "-1", "--format=%h") + mark
+    return _ASKED["version"]
 
 
 def has_rival() -> bool:
-    """Whether fmm3dpy can be imported."""
+    """Whether fmm3dpy can be imported, or need not be."""
+    if "dry" in _ASKED:
+        return True
     call = [sys.executable, "-c", "import fmm3dpy"]
     return subprocess.run(call, capture_output=True, check=False).returncode == 0
 
@@ -383,7 +388,7 @@ def _draw_smooth(axis: Any, found: list[Record]) -> None:
 def table(records: list[Record]) -> str:
     """The comparison, growth with the points and the machine's limits, as Markdown."""
     lines = [
-        f"`scripts/bench/fmm.py` at {commit()}.",
+        f"`scripts/bench/fmm.py` at {records[0].commit if records else commit()}.",
         "",
         "| kernel | points | error | ours (plan) [s] | FMM3D [s] | FMM3D / ours | direct [s] |",
         "|---|---|---|---|---|---|---|",
@@ -464,10 +469,18 @@ def main() -> None:
     parser = arguments(__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
     parser.add_argument("--page", type=Path, help="put the table into this Markdown file")
+    parser.add_argument("--dry", action="store_true", help="measure nothing, use what is known")
+    parser.add_argument("--version", help="take what this version of stokes/fmm measured")
     options = parser.parse_args()
+    if options.version:
+        _ASKED["version"] = options.version
+    if options.dry:
+        _ASKED["dry"] = "yes"
     records: list[Record] = []
     for part in options.only:
         for record in globals()[part](options.quick):
+            if options.version:
+                record.commit = options.version
             write([record])
             records.append(record)
     records += growth(records)
