@@ -10,43 +10,13 @@ import pytest
 from stokes.fmm import lists, tree
 from stokes.fmm.symmetry import VECTORS
 
+from clouds import all_equal, clustered, collinear, cube, prolate_spheroid, sphere, two_far_clusters
+
 UNIFORM_LEVEL_VECTORS = 316
-
-
-def cube(n, rng):
-    return rng.random((n, 3))
-
-
-def sphere(n, rng):
-    x = rng.standard_normal((n, 3))
-    return x / np.linalg.norm(x, axis=1)[:, None]
-
-
-def prolate_spheroid(n, rng):
-    return sphere(n, rng) * [0.1, 0.1, 1.0]
-
-
-def clustered(n, rng):
-    """Balls of radii 1, 0.1, ... 1e-5 about random centres."""
-    radius = 10.0 ** -rng.integers(0, 6, n)
-    centre = rng.random((6, 3))[rng.integers(0, 6, n)]
-    return centre + radius[:, None] * (rng.random((n, 3)) - 0.5)
-
-
-def two_far_clusters(n, rng):
-    return 1e-4 * rng.random((n, 3)) + (np.arange(n) % 2)[:, None]
-
-
-def collinear(n, rng):
-    return rng.random((n, 1)) * [1.0, 2.0, -0.5]
 
 
 def planar(n, rng):
     return rng.random((n, 2)) @ [[1.0, 0.0, 0.3], [0.0, 1.0, -0.2]]
-
-
-def all_equal(n, rng):
-    return np.tile(rng.random(3), (n, 1))
 
 
 def duplicated(n, rng):
