@@ -37,7 +37,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from records import BUILD, ROOT, Record, arguments, commit, save, write
+from records import BUILD, ROOT, Record, arguments, commit, put, save, write
 
 CACHE = BUILD / "fmm"
 WORKER = Path(__file__).resolve().parent / "lib" / "fmm_work.py"
@@ -455,16 +455,6 @@ def _limit_lines(found: list[Record]) -> list[str]:
     ]
 
 
-def put(text: str, page: Path) -> None:
-    """Put the table between the markers of a Markdown page."""
-    begin, end = "<!-- fmm table -->", "<!-- end of fmm table -->"
-    whole = page.read_text()
-    if begin not in whole:
-        raise SystemExit(f"{page}: no line {begin!r} to put the table after")
-    head, _, rest = whole.partition(begin)
-    page.write_text(f"{head}{begin}\n{text}\n{end}{rest.partition(end)[2]}")
-
-
 def main() -> None:
     parser = arguments(__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS)
@@ -493,7 +483,7 @@ def main() -> None:
     if options.page:
         if not any(_compared(r) for r in records):
             raise SystemExit("--page: nothing compared; take the part `rival`")
-        put(table(records), options.page)
+        put("fmm", table(records), options.page)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from typing import Any
 
 from lib import piles
 from lib.preconditioner_work import CANDIDATES, EXACT, Trial, measure, missing
-from records import BUILD, Record, arguments, mpirun, write
+from records import BUILD, Record, arguments, mpirun, put, write
 from scip import checked_out
 
 # Newton iterations at which candidates are tried, from 1: early, middle, late.
@@ -36,7 +36,6 @@ QUICK = ("pile-2000/settled",)
 ACCURACY = 1e-6  # m/s, of the interior point solve
 TOLERANCES = (1e-4, 1e-10)
 NAMES = ("10⁻⁴", "10⁻¹⁰")
-MARKERS = ("<!-- preconditioners: begin -->", "<!-- preconditioners: end -->")
 
 Found = dict[str, dict[str, Any]]
 
@@ -167,15 +166,6 @@ def _decade(value: float) -> str:
     return "10" + exponent.translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
-def put(text: str, page: Path) -> None:
-    """Replace what stands between the markers of a page."""
-    before, _, rest = page.read_text().partition(MARKERS[0])
-    _, end, after = rest.partition(MARKERS[1])
-    if not end:
-        raise SystemExit(f"{page}: no '{MARKERS[0]}' with '{MARKERS[1]}' behind it")
-    page.write_text(f"{before}{MARKERS[0]}\n\n{text}\n\n{MARKERS[1]}{after}")
-
-
 # ---- figure --------------------------------------------------------------------------------
 
 
@@ -223,7 +213,7 @@ def main() -> None:
     records = [replace(record, commit=checked_out()) for record in records_of(found)]
     write(records, options.json)
     if options.page:
-        put(tables(found), options.page)
+        put("preconditioners", tables(found), options.page)
     if options.figure:
         draw(found, options.figure)
 

@@ -66,6 +66,16 @@ def save(records: list[Record], path: Path | None) -> None:
         path.write_text(json.dumps([asdict(r) for r in records], indent=1) + "\n")
 
 
+def put(name: str, text: str, page: Path) -> None:
+    """Replace what stands in a Markdown page between the markers of this name."""
+    begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
+    before, _, rest = page.read_text().partition(begin)
+    _, found, after = rest.partition(end)
+    if not found:
+        raise SystemExit(f"{page}: no '{begin}' with '{end}' behind it")
+    page.write_text(f"{before}{begin}\n\n{text}\n\n{end}{after}")
+
+
 def mpirun(ranks: int, command: list[str], limit: float | None = None) -> None:
     """Run this interpreter with `command` on so many ranks, one thread each; raise if it fails.
 

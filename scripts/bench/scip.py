@@ -38,7 +38,7 @@ from typing import Any
 
 import numpy as np
 from lib import piles
-from records import BUILD, ROOT, Record, arguments, mpirun, write
+from records import BUILD, ROOT, Record, arguments, mpirun, put, write
 
 CACHE = BUILD / "scip"
 LADDER = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
@@ -562,18 +562,6 @@ def _coulomb_table(known: Known, state: str) -> str:
     return _table(f"Coulomb's law: {state}", heads, rows)
 
 
-MARKERS = ("<!-- tables: begin -->", "<!-- tables: end -->")
-
-
-def put(text: str, page: Path) -> None:
-    """Replace what stands between the markers of a page."""
-    before, _, rest = page.read_text().partition(MARKERS[0])
-    _, end, after = rest.partition(MARKERS[1])
-    if not end:
-        raise SystemExit(f"{page}: no '{MARKERS[0]}' with '{MARKERS[1]}' behind it")
-    page.write_text(f"{before}{MARKERS[0]}\n\n{text}\n\n{MARKERS[1]}{after}")
-
-
 # ---- figure --------------------------------------------------------------------------------
 
 
@@ -674,7 +662,7 @@ def main() -> None:
     records = [replace(record, commit=version) for record in records_of(known)]
     write(records, options.json)
     if options.page:
-        put(tables(known, records, version), options.page)
+        put("tables", tables(known, records, version), options.page)
     if options.figure:
         draw(known, options.figure)
 
