@@ -4,7 +4,8 @@ Rotated into the frames of target and source (radial, azimuthal, axial), every k
     (polynomial of degree <= 4 in v, times sin t where the entry is odd) * q^{-m-1/2},
 t the angle between the two, and its mode n = int K(t) e^{-int} dt a sum of products of
 coefficients, which do not depend on n, and moments, which do not depend on the kernel:
-    even[k, m, n] = int v^k cos(nt) q^{-m-1/2} dt,   odd[k, m, n] = int v^k sin t sin(nt) q^{-m-1/2} dt.
+    even[k, m, n] = int v^k cos(nt) q^{-m-1/2} dt,
+    odd[k, m, n]  = int v^k sin t sin(nt) q^{-m-1/2} dt.
 
 Two bases serve. Away from the diagonal and up to the axis, v = cos t. Near it (chi < 3), v =
 1 - cos t with coefficients made of the differences dr, dz and of the offsets nu.(x - x'): there
@@ -395,7 +396,7 @@ def modal_modes(kind, target, source, dr, dz, offsets, n_max, workspace, out):
         _moments_near(d2, p, m_max, _DEGREE[kind, m_max] - m_max, n_max, even, odd)
     else:
         _moments_far(d2, p, m_max, _DEGREE[kind], n_max, even, odd)
-    stress = kind == STRESS_SINGLE or kind == STRESS_DOUBLE
+    stress = kind in (STRESS_SINGLE, STRESS_DOUBLE)
     rows = ROWS[kind]
     count = 21 if stress else 3 * rows
     for m in range(m_max + 1):
