@@ -1,0 +1,351 @@
+"""Boundary integral equations of one rigid body, factored once and solved mode by mode.
+
+All equations are those of the unit shape in a fluid of viscosity 1; they take velocities to
+densities. A body `scale` times as large in a fluid of viscosity v has the same density q; the
+world's single layer density rho [force/area] and double layer density mu [velocity] are what
+`ShapeSolver.layers` makes of q. The flow is u = S rho / v + D mu, the force of the fluid on the
+body - int rho, its torque - int x cross rho (the double layer exerts none).
+
+    single      S q = u                      first kind; rho = v q / scale
+    combined    (1/2 + D + eta S / L) q = u  second kind; mu = q, rho = eta v q / (L scale)
+    completed   (1/2 + D + eta S P / L) q = u     the same, rho = eta v P q / (L scale)
+    interior    (-1/2 + D) q = u             second kind, the flow inside; mu = q
+    traction    (1/2 + T + P) q = -t         second kind, for mobility: the traction inside is -t
+
+P projects on rigid motions, L = sqrt(area / 4 pi) of the unit shape. `combined` and `completed`
+add to D, whose flows exert no force, just what the six rigid motions (1/2 + D) q = 0 need, and are
+uniquely solvable. S vanishes on q = n, the normals, and n spans the left null space of -1/2 + D:
+both are made regular by adding n <n, q> (times a constant). The solution is then the one with
+<n, q> = 0 wherever there is one, which is where no fluid flows through the surface: <n, u> = 0.
+In `traction` the body is filled with fluid in which S q leaves no stress, hence moves as the body
+does (E. Corona, L. Greengard, M. Rachh, S. Veerapaneni, J. Comput. Phys. 332, 2017).
+
+Symbols: q density (n_s, n_theta, 3[, m]) of local Cartesian components, K rigid motions, B loads.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable
+from enum import StrEnum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import lapack
+
+from stokes.geometry import Curve, Resolution
+from stokes.modes import from_modes, to_modes
+from stokes.operators import Layer, ModalOperators
+
+Array = NDArray[np.float64]
+
+
+class Formulation(StrEnum):
+    """Which integral equation; see the head of this module."""
+
+    SINGLE = "single"
+    COMBINED = "combined"
+    COMPLETED = "completed"
+    INTERIOR = "interior"
+    TRACTION = "traction"
+
+
+_KINDS = {
+    Formulation.SINGLE: (Layer.SINGLE,),
+    Formulation.COMBINED: (Layer.SINGLE, Layer.DOUBLE),
+    Formulation.COMPLETED: (Layer.SINGLE, Layer.DOUBLE),
+    Formulation.INTERIOR: (Layer.DOUBLE,),
+    Formulation.TRACTION: (Layer.TRACTION,),
+}
+_IDENTITY = {
+    Formulation.SINGLE: 0.0,
+    Formulation.COMBINED: 0.5,
+    Formulation.COMPLETED: 0.5,
+    Formulation.INTERIOR: -0.5,
+    Formulation.TRACTION: 0.5,
+}
+
+
+class ShapeSolver:
+    """One formulation on one unit shape at one resolution.
+
+    `matrices` (modes + 1, 3 n_s, 3 n_s) are the operator's in the real form of `stokes.modes`;
+    factorisations and plain-rule blocks are made when first asked for and kept. Every method takes
+    any number of fields at once on a trailing axis.
+    """
+
+    def __init__(
+        self,
+        operators: ModalOperators,
+        formulation: Formulation | str = Formulation.COMBINED,
+        eta: float = 1.0,
+    ) -> None:
+        self.operators = operators
+        self.formulation = Formulation(formulation)
+        self.eta = float(eta)
+        self.grid = operators.grid
+        self.length = math.sqrt(self.grid.area / (4.0 * math.pi))
+        layers = {kind: operators.matrices(kind) for kind in _KINDS[self.formulation]}
+        self.matrices = self._compose(layers)
+        self._add_identity_and_lift()
+        self._corrections: dict[Resolution | None, Array] = {}
+
+    # ---- the operator ------------------------------------------------------------------------
+
+    def apply(self, density: Array) -> Array:
+        """A q on the nodes; density and result (n_s, n_theta, 3[, m])."""
+        return self._multiply(self.matrices, density)
+
+    def solve(self, field: Array) -> Array:
+        """A^-1 u; field and result (n_s, n_theta, 3[, m])."""
+        coefficients = to_modes(field)
+        for (lu, pivots), rows in zip(self._factors, coefficients, strict=True):
+            # The rows are the columns of a Fortran array, which LAPACK overwrites in place.
+            solution, info = lapack.dgetrs(lu, pivots, rows.T, trans=1, overwrite_b=1)
+            if info != 0:
+                raise ValueError(f"dgetrs: argument {-info} is illegal")
+            if not np.shares_memory(solution, rows):
+                rows[:] = solution.T
+        return from_modes(coefficients, self.grid.shape[1], np.shape(field)[3:])
+
+    def smooth_self(self, density: Array, sources: Resolution | None = None) -> Array:
+        """What a sum over surface nodes, own node left out, gives at the nodes: the plain rule.
+
+        Of the layers alone, without identity and rank-one terms: what a fast summation over all
+        sources adds up of this body itself, (n_s, n_theta, 3[, m]). `sources` are the nodes that
+        the density is interpolated to before summing (same panels, an odd multiple of the
+        azimuths); None: the nodes themselves.
+        """
+        return self._multiply(self._plain(sources), density)
+
+    def self_correction(self, density: Array, sources: Resolution | None = None) -> Array:
+        """`apply` minus `smooth_self`, by one product with matrices that are kept."""
+        if sources not in self._corrections:
+            self._corrections[sources] = self.matrices - self._plain(sources)
+        return self._multiply(self._corrections[sources], density)
+
+    def layers(
+        self, density: Array, scale: float = 1.0, viscosity: float = 1.0
+    ) -> tuple[Array | None, Array | None]:
+        """The world's densities (rho [force/area], mu [velocity]) of q, None for one that is zero.
+
+        Local Cartesian components; u = S rho / viscosity + D mu.
+        """
+        if self.formulation is Formulation.INTERIOR:
+            return None, density
+        if self.formulation in (Formulation.SINGLE, Formulation.TRACTION):
+            return viscosity / scale * density, None
+        factor = self.eta * viscosity / (self.length * scale)
+        if self.formulation is Formulation.COMBINED:
+            return factor * density, density
+        return factor * self.rigid_part(density), density
+
+    # ---- rigid motions and loads -------------------------------------------------------------
+
+    @cached_property
+    def rigid_motions(self) -> Array:
+        """K (n_s, n_theta, 3, 6): unit velocities along x, y, z and unit rotations about them."""
+        return rigid_motions(self.grid.points)
+
+    def loads(self, single_layer: Array) -> Array:
+        """B rho = (int rho, int x cross rho), (6[, m]): what the body exerts on the fluid."""
+        return np.tensordot(self._weighted_motions, single_layer, axes=((0, 1, 2), (0, 1, 2)))
+
+    def rigid_part(self, density: Array) -> Array:
+        """P q, the rigid motion next to q in the mean square over the surface."""
+        motion = np.linalg.solve(self._motion_gram, self.loads(density))
+        return np.tensordot(self.rigid_motions, motion, axes=1)
+
+    @cached_property
+    def resistance(self) -> Array:
+        """(6, 6): force and torque exerted for unit velocities and rotations, viscosity 1."""
+        return self._grand_resistance[1]
+
+    def solve_mobility(
+        self, field: Array, force: ArrayLike = (0.0,) * 3, torque: ArrayLike = (0.0,) * 3
+    ) -> tuple[Array, Array, Array]:
+        """Density, velocity (3[, m]) and rotation (3[, m]) of a body under given loads.
+
+        Solves A q - K V = field, B rho(q) = (force, torque), the loads applied to the body;
+        `field` (n_s, n_theta, 3[, m]) is the slip minus the flow without the body. In the
+        formulation `traction` it is minus the traction of the flow without the body, and V does
+        not hold the mean of that flow. Loads (3[, m]) of the unit shape at viscosity 1.
+        """
+        fields = np.shape(field)[3:]
+        load = np.concatenate(
+            [np.broadcast_to(_columns(a, fields), (3, *fields)) for a in (force, torque)]
+        )
+        if self.formulation is Formulation.TRACTION:
+            return self._solve_traction(field, load)
+        single_layer, _ = self.layers(self.solve(field))
+        if single_layer is None:
+            raise ValueError("the interior formulation has no mobility problem")
+        _, resistance = self._grand_resistance
+        motion = np.linalg.solve(resistance, load - self.loads(single_layer))
+        density = self.solve(field + np.tensordot(self.rigid_motions, motion, axes=1))
+        return density, motion[:3], motion[3:]
+
+    def _solve_traction(self, field: Array, load: Array) -> tuple[Array, Array, Array]:
+        carrier = np.tensordot(self.rigid_motions, np.linalg.solve(self._motion_gram, load), axes=1)
+        inside = self.apply(carrier) - carrier  # P of a rigid motion is itself
+        density = carrier + self.solve(field - inside)
+        velocity = self._multiply(self.operators.matrices(Layer.SINGLE), density)
+        motion = np.linalg.solve(self._motion_gram, self.loads(velocity))
+        return density, motion[:3], motion[3:]
+
+    @cached_property
+    def _grand_resistance(self) -> tuple[Array, Array]:
+        densities = self.solve(self.rigid_motions)
+        single_layer, _ = self.layers(densities)
+        if single_layer is None:
+            raise ValueError("the interior formulation has no resistance")
+        return densities, self.loads(single_layer)
+
+    @cached_property
+    def _weighted_motions(self) -> Array:
+        return self.grid.weights[:, :, None, None] * self.rigid_motions
+
+    @cached_property
+    def _motion_gram(self) -> Array:
+        """<K, K>, (6, 6)."""
+        return self.loads(self.rigid_motions)
+
+    # ---- matrices ----------------------------------------------------------------------------
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of matrices and factorisations held by this object."""
+        factors = self.__dict__.get("_factors", ())
+        held = [self.matrices, *self._corrections.values(), *(lu for lu, _ in factors)]
+        return sum(array.nbytes for array in held)
+
+    def condition_numbers(self) -> Array:
+        """Condition of each mode in the norm of L2 on the surface, (modes + 1,)."""
+        root = np.sqrt(self._line_weights)
+        scaled = root[:, None] * self.matrices / root
+        values = np.linalg.svd(scaled, compute_uv=False)
+        return values[:, 0] / values[:, -1]
+
+    @cached_property
+    def _factors(self) -> list[tuple[Array, NDArray]]:
+        """LU of the transposes: to LAPACK, a matrix in C order is its transpose."""
+        factors = []
+        for n, matrix in enumerate(self.matrices):
+            lu, pivots, info = lapack.dgetrf(matrix.T)
+            if info != 0:
+                raise ValueError(f"{self.formulation}: mode {n} is singular")
+            factors.append((lu, pivots))
+        return factors
+
+    @cached_property
+    def _line_weights(self) -> Array:
+        """Weights of int . r dl for vectors (component, node), (3 n_s,)."""
+        meridian = self.operators.meridian
+        return np.tile(meridian.weights * meridian.r, 3)
+
+    def _plain(self, sources: Resolution | None) -> Array:
+        kinds = _KINDS[self.formulation]
+        return self._compose({kind: self.operators.plain(kind, sources) for kind in kinds})
+
+    def _compose(self, layers: dict[Layer, Array]) -> Array:
+        """The layers of this formulation, without identity and lift."""
+        if self.formulation in (Formulation.SINGLE, Formulation.INTERIOR, Formulation.TRACTION):
+            return layers[_KINDS[self.formulation][0]].copy()
+        single = self.eta / self.length * layers[Layer.SINGLE]
+        if self.formulation is Formulation.COMBINED:
+            return single + layers[Layer.DOUBLE]
+        total = layers[Layer.DOUBLE].copy()
+        for n, projection in enumerate(self._projections()):
+            total[n] += single[n] @ projection
+        return total
+
+    def _add_identity_and_lift(self) -> None:
+        diagonal = np.arange(self.matrices.shape[1])
+        self.matrices[:, diagonal, diagonal] += _IDENTITY[self.formulation]
+        if self.formulation in (Formulation.SINGLE, Formulation.INTERIOR):
+            meridian = self.operators.meridian
+            n = np.concatenate([meridian.normal_r, np.zeros(meridian.size), meridian.normal_z])
+            lift = np.outer(n, n * self._line_weights) / self._line_weights[: meridian.size].sum()
+            self.matrices[0] += lift * (
+                self.length if self.formulation is Formulation.SINGLE else 1.0
+            )
+        elif self.formulation is Formulation.TRACTION:
+            for n, projection in enumerate(self._projections()):
+                self.matrices[n] += projection
+
+    def _projections(self) -> list[Array]:
+        """P in modes 0 and 1, the only ones of rigid motions; (3 n_s, 3 n_s) each."""
+        r, z = self.operators.meridian.r, self.operators.meridian.z
+        zero, one = np.zeros_like(r), np.ones_like(r)
+        # Real form: e_z and e_z cross x in mode 0; e_x and e_x cross x, to a factor, in mode 1.
+        motions = [
+            [(zero, zero, one), (zero, r, zero)],
+            [(one, one, zero), (z, z, -r)],
+        ]
+        projections = []
+        for pair in motions[: self.operators.resolution.modes + 1]:
+            basis = np.stack([np.concatenate(motion) for motion in pair], axis=1)
+            weighted = self._line_weights[:, None] * basis
+            projections.append(basis @ np.linalg.solve(basis.T @ weighted, weighted.T))
+        return projections
+
+    def _multiply(self, matrices: Array, density: Array) -> Array:
+        rows = to_modes(density) @ np.swapaxes(matrices, 1, 2)
+        return from_modes(rows, self.grid.shape[1], np.shape(density)[3:])
+
+
+class OperatorCache:
+    """Operators and factorisations, one of each for a shape and a resolution, shared by its bodies.
+
+    An object of the caller: dropping it frees everything. `nbytes` tells what it holds.
+    """
+
+    def __init__(self) -> None:
+        self._operators: dict[Hashable, ModalOperators] = {}
+        self._solvers: dict[Hashable, ShapeSolver] = {}
+
+    def operators(self, curve: Curve, resolution: Resolution) -> ModalOperators:
+        """The layer potentials of this shape at this resolution."""
+        key = (curve, resolution)
+        if key not in self._operators:
+            self._operators[key] = ModalOperators(curve, resolution)
+        return self._operators[key]
+
+    def solver(
+        self,
+        curve: Curve,
+        resolution: Resolution,
+        formulation: Formulation | str = Formulation.COMBINED,
+        eta: float = 1.0,
+    ) -> ShapeSolver:
+        """The solver of this shape at this resolution; `eta` as for `ShapeSolver`."""
+        key = (curve, resolution, Formulation(formulation), float(eta))
+        if key not in self._solvers:
+            operators = self.operators(curve, resolution)
+            self._solvers[key] = ShapeSolver(operators, formulation, eta)
+        return self._solvers[key]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all matrices and factorisations."""
+        held = (*self._operators.values(), *self._solvers.values())
+        return sum(part.nbytes for part in held)
+
+    def release_operators(self) -> None:
+        """Forget the layers' own matrices, which solvers already made no longer need."""
+        for operators in self._operators.values():
+            operators.release()
+
+
+def rigid_motions(points: Array) -> Array:
+    """Velocities (..., 3, 6) at points (..., 3) of unit velocities and of unit rotations."""
+    identity = np.broadcast_to(np.eye(3), (*points.shape, 3))
+    rotations = np.cross(np.eye(3), points[..., None, :])  # (..., axis, 3)
+    return np.concatenate([identity, np.swapaxes(rotations, -1, -2)], axis=-1)
+
+
+def _columns(vector: ArrayLike, fields: tuple[int, ...]) -> Array:
+    """A vector (3,) or (3, m) such that it broadcasts to (3, *fields)."""
+    vector = np.asarray(vector, dtype=np.float64)
+    return vector.reshape(*vector.shape, *[1] * (1 + len(fields) - vector.ndim))
