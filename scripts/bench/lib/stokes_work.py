@@ -1,0 +1,330 @@
+"""What the ranks of stokes.py do: one measurement of flow around rigid bodies, in a process.
+
+A task is a dictionary with `kind`, and beside it
+
+    single     panels, modes: S. De's section 3.6.1 at one resolution
+    solve      scene, data, formulation, tolerance, resolution, options: one suspension
+    multiblob  scene, blobs, reference: the rival on the same bodies
+    squirmers  edge, spacing, tolerance: S. De's section 3.6.3
+
+`scene` is [name of a function of stokes_scenes, its arguments]. `data` are velocities at the
+surfaces: "point_forces" of a flow that is known exactly, or "rigid", a motion of each body.
+"""
+
+from __future__ import annotations
+
+import resource
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from lib import stokes_scenes as scenes
+from lib.stokes_scenes import PointForces, Scene
+from numpy.typing import NDArray
+
+from dem_mpi.parallel import Parallel
+
+NODES = 10  # of a panel, S. De's
+FAR_POINTS, NEAR_POINTS = 1000, 600
+NEAR_DISTANCES = (1e-1, 1e-2, 1e-3)
+
+
+def work(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
+    """Collective. Do a task; rank 0 has all of the result."""
+    return {
+        "single": _single,
+        "solve": _solve,
+        "multiblob": _multiblob,
+        "squirmers": _squirmers,
+    }[task["kind"]](parallel, task)
+
+
+class Clock:
+    """Seconds of named pieces of work, between barriers."""
+
+    def __init__(self, parallel: Parallel) -> None:
+        self._parallel = parallel
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def of(self, name: str) -> Iterator[None]:
+        """Collective. Add what the block takes to the seconds of `name`."""
+        self._parallel.barrier()
+        began = perf_counter()
+        yield
+        self._parallel.barrier()
+        self.seconds[name] = self.seconds.get(name, 0.0) + perf_counter() - began
+
+
+def scene_of(task: dict[str, Any]) -> Scene:
+    """The scene that a task names."""
+    name, arguments = task["scene"]
+    if name == "random_spheroids":
+        arguments = arguments | {"directory": Path(arguments["directory"])}
+    return getattr(scenes, name)(**arguments)
+
+
+def _memory(parallel: Parallel) -> float:
+    """Largest resident set so far of all ranks together [bytes]."""
+    return parallel.sum(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0)
+
+
+# ---- one body ------------------------------------------------------------------------------
+
+
+def _single(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
+    """Seconds of each stage and the error outside, with the single layer."""
+    from stokes.evaluate import evaluate
+    from stokes.formulation import ShapeSolver
+    from stokes.geometry import Resolution, SurfaceGrid
+    from stokes.operators import ModalOperators
+
+    scene = scenes.single()
+    (body,) = scene.bodies()
+    flow, points = scenes.forces_inside_single(scene), scenes.points_around_single(scene)
+    exact = flow.velocity(points)
+
+    def once(resolution: Resolution) -> tuple[dict[str, float], NDArray]:
+        clock = Clock(parallel)
+        with clock.of("kernels"):
+            operators = ModalOperators(body.curve, resolution)
+            operators.matrices("single")
+        with clock.of("factorisation"):
+            solver = ShapeSolver(operators, task["formulation"])
+            solver.factorise()
+        grid: SurfaceGrid = solver.grid
+        data = body.vectors_to_local(flow.velocity(body.to_world(grid.points.reshape(-1, 3))))
+        with clock.of("solve"):
+            density = solver.solve(data.reshape(grid.points.shape))
+        with clock.of("evaluation"):
+            rho, mu = solver.layers(density, body.scale)
+            found = evaluate([body], [resolution], rho, mu, points, tolerance=1e-14)
+        return clock.seconds, found
+
+    once(Resolution.uniform(2, NODES, 4))  # compiles, or loads what is compiled
+    resolution = Resolution.uniform(task["panels"], NODES, task["modes"])
+    rounds = [once(resolution) for _ in range(task.get("runs", 1))]
+    error = np.abs(rounds[-1][1] - exact)
+    return {
+        "nodes": resolution.surface_nodes,
+        "seconds": {k: float(np.median([s[k] for s, _ in rounds])) for k in rounds[0][0]},
+        "runs": len(rounds),
+        "error_absolute": float(error.max()),
+        "error_to_largest": float(error.max() / np.abs(exact).max()),
+        "error_by_component": float((error / np.abs(exact)).max()),
+        "memory": _memory(parallel),
+    }
+
+
+# ---- a suspension --------------------------------------------------------------------------
+
+
+def _solve(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
+    """One suspension: seconds by phase, iterations, errors; once before to compile."""
+    _warm_up(parallel, task)
+    return _measured(parallel, scene_of(task), task)
+
+
+def _warm_up(parallel: Parallel, task: dict[str, Any]) -> None:
+    """Compile, or load what is compiled, by two bodies that nearly touch."""
+    small = scenes.pair((0.6, 1.0), 0.15, "side")
+    _measured(parallel, small, task | {"tolerance": 1e-3, "resolution": None, "points": False})
+
+
+def suspension_of(parallel: Parallel, scene: Scene, task: dict[str, Any]) -> Any:
+    """Collective. The suspension that a task asks for, this rank with its share of the bodies."""
+    from stokes.geometry import Resolution
+    from stokes.suspension import Suspension, SuspensionOptions, distribute
+
+    options = dict(task.get("options", {}))
+    if task.get("resolution"):
+        panels, modes = task["resolution"]
+        options["resolution"] = Resolution.uniform(panels, NODES, modes)
+    return Suspension(
+        distribute(scene.bodies(), parallel),
+        tolerance=task["tolerance"],
+        formulation=task["formulation"],
+        parallel=parallel,
+        options=SuspensionOptions(**options),
+    )
+
+
+def _measured(parallel: Parallel, scene: Scene, task: dict[str, Any]) -> dict[str, Any]:
+    clock = Clock(parallel)
+    flow = scenes.forces_at_centres(scene)
+    with clock.of("set-up"):
+        suspension = suspension_of(parallel, scene, task)
+    with clock.of("solve"):
+        if task["data"] == "point_forces":
+            solution = suspension.solve(boundary_velocity=flow.velocity(suspension.nodes))
+        else:
+            velocity, spin = motion_of(scene, task["data"])
+            solution = suspension.solve(
+                velocity=velocity[suspension.mine], angular_velocity=spin[suspension.mine]
+            )
+    found = described(parallel, scene, suspension, solution)
+    loads = np.array(found["loads"])
+    if task["data"] == "point_forces":
+        found["error_of_forces"] = float(np.abs(loads[:, :3] + flow.forces).max())
+        if task.get("points", True):
+            found |= _errors_at_points(parallel, clock, scene, flow, solution)
+    return found | {"seconds": clock.seconds, "memory": _memory(parallel)}
+
+
+def motion_of(scene: Scene, data: str) -> tuple[NDArray, NDArray]:
+    """Velocities and angular velocities (n, 3): random, or along z, alike or in turn opposed."""
+    rest = np.zeros((scene.count, 3))
+    if data == "random":
+        rng = np.random.default_rng([scenes.SEED, 5])
+        return rng.standard_normal((scene.count, 3)), rng.standard_normal((scene.count, 3))
+    along = np.zeros((scene.count, 3))
+    sign = np.where(np.arange(scene.count) % 2 == 0, 1.0, -1.0)
+    along[:, 2] = 1.0 if data in ("same", "spin_same") else sign
+    return (rest, along) if data.startswith("spin") else (along, rest)
+
+
+def described(parallel: Parallel, scene: Scene, suspension: Any, solution: Any) -> dict[str, Any]:
+    """Collective. What is said of a solution whatever was asked."""
+    loads = np.zeros((scene.count, 6))
+    loads[suspension.mine] = np.concatenate([solution.forces, solution.torques], axis=1)
+    parallel.sum_in_place(loads)
+    return {
+        "bodies": scene.count,
+        "nodes": parallel.sum(len(suspension.nodes)),
+        "gap": scene.gap,
+        "volume_fraction": scene.volume_fraction,
+        "iterations": solution.iterations,
+        "converged": bool(solution.converged),
+        "residual": float(solution.residuals[-1]),
+        "phases": {k: parallel.max(float(v)) for k, v in dict(solution.seconds).items()},
+        "loads": loads.tolist(),
+    }
+
+
+def _errors_at_points(
+    parallel: Parallel, clock: Clock, scene: Scene, flow: PointForces, solution: Any
+) -> dict[str, Any]:
+    """Collective. Largest errors in the box (with one) and at each distance from the surfaces."""
+    sets: dict[str, NDArray] = {}
+    if scene.box:
+        sets["box"] = scenes.points_in_box(scene, FAR_POINTS)
+    for distance in NEAR_DISTANCES:
+        sets[f"{distance:g}"] = scenes.points_at_surfaces(scene, NEAR_POINTS, [distance])
+    absolute, relative = {}, {}
+    for name, points in sets.items():
+        share = slice(parallel.rank, None, parallel.size)
+        with clock.of(f"evaluation {name}"):
+            u = solution.velocity(points[share])
+        exact = flow.velocity(points[share])
+        worst = parallel.max(float(np.abs(u - exact).max(initial=0.0)))
+        largest = parallel.max(float(np.abs(exact).max(initial=0.0)))
+        absolute[name], relative[name] = worst, worst / largest
+    return {"error_absolute": absolute, "error_to_largest": relative}
+
+
+# ---- the rival -----------------------------------------------------------------------------
+
+
+def _multiblob(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
+    """Loads on the same bodies by shells of blobs; one rank."""
+    from lib.multiblob import Multiblob, shell
+
+    scene = scene_of(task)
+    velocity, spin = motion_of(scene, task["data"])
+
+    def once(count: int, blobs: int) -> tuple[Any, float]:
+        began = perf_counter()
+        shells = {
+            tuple(axes): shell((axes[0], axes[0], axes[1]), blobs)
+            for axes in scene.semi_axes[:count].tolist()
+        }
+        chosen = [shells[tuple(axes)] for axes in scene.semi_axes[:count].tolist()]
+        rotations, centres = scene.rotations[:count], scene.centres[:count]
+        solver = Multiblob(chosen, centres, rotations, task["tolerance"])
+        found = solver.solve(velocity[:count], spin[:count])
+        return found, perf_counter() - began
+
+    once(2, 20)
+    solution, whole = once(scene.count, task["blobs"])
+    loads = np.concatenate([solution.forces, solution.torques], axis=1)
+    return {
+        "bodies": scene.count,
+        "nodes": task["blobs"] * scene.count,
+        "iterations": solution.iterations,
+        "residual": solution.residual,
+        "converged": True,
+        "seconds": {"set-up": whole - solution.solve, "solve": solution.solve},
+        "loads": loads.tolist(),
+        "memory": _memory(parallel),
+    }
+
+
+# ---- active spheroids ----------------------------------------------------------------------
+
+
+def pole_to_pole(bodies: Sequence[Any], nodes: Sequence[NDArray], speed: float) -> list[NDArray]:
+    """Slip (k, 3) at nodes (k, 3) of each spheroid, along meridians from pole to pole.
+
+    speed r / equatorial: `speed` at the equator, zero at the poles.
+    """
+    slips = []
+    for body, points in zip(bodies, nodes, strict=True):
+        a, c = body.curve.equatorial, body.curve.polar
+        x, y, z = body.to_local(points).T
+        r2 = x**2 + y**2
+        # r times the meridian's tangent (-z r_hat / c^2 + r z_hat / a^2, normalised)
+        tangent = np.stack([-z * x / c**2, -z * y / c**2, r2 / a**2], axis=1)
+        length = np.sqrt(r2 / a**4 + z**2 / c**4)
+        slips.append(body.vectors_to_world(speed / a * tangent / length[:, None]))
+    return slips
+
+
+def _squirmers(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
+    """Seconds of a solve with the spheroids held, and free; flow on a plane through them."""
+    _warm_up(parallel, task)
+    scene = scenes.grid_of_spheroids(task["edge"], task["spacing"])
+    clock = Clock(parallel)
+    with clock.of("set-up"):
+        suspension = suspension_of(parallel, scene, task)
+    bodies = suspension.bodies
+    nodes = np.split(suspension.nodes, np.cumsum(suspension.nodes_by_body)[:-1])
+    slip = np.concatenate(pole_to_pole(bodies, nodes, task["speed"]))
+    with clock.of("held"):
+        held = suspension.solve(boundary_velocity=slip)
+    found = described(parallel, scene, suspension, held)
+    rest = np.zeros((len(bodies), 3))
+    with clock.of("free"):
+        free = suspension.solve(force=rest, torque=rest, slip=slip)
+    points, shape = _plane(scene, task["pixels"])
+    share = slice(parallel.rank, None, parallel.size)
+    with clock.of("evaluation"):
+        mine = held.velocity(points[share])
+    velocity = np.zeros((len(points), 3))
+    velocity[share] = np.nan_to_num(mine)
+    parallel.sum_in_place(velocity)
+    if parallel.rank == 0 and task.get("field"):
+        outside = ~scene.inside(points, 0.0)
+        np.savez(
+            task["field"],
+            velocity=velocity.reshape(*shape, 3),
+            outside=outside.reshape(shape),
+            box=scene.box,
+        )
+    return found | {
+        "iterations_free": free.iterations,
+        "fastest": parallel.max(float(np.linalg.norm(free.velocities, axis=1).max())),
+        "seconds": clock.seconds,
+        "points": len(points),
+        "memory": _memory(parallel),
+    }
+
+
+def _plane(scene: Scene, pixels: int) -> tuple[NDArray, tuple[int, int]]:
+    """Points (k, 3) of a plane through the middle layer of the grid, x fastest."""
+    side = np.linspace(0.0, scene.box, pixels)
+    z, x = np.meshgrid(side, side, indexing="ij")
+    y = np.full(x.size, 0.5 * scene.box)
+    return np.stack([x.ravel(), y, z.ravel()], axis=1), (pixels, pixels)
