@@ -1,0 +1,56 @@
+"""The sums by which layers' velocity, pressure and stress are evaluated, and their one new kernel.
+
+The stress of a double layer, rows in the order 00, 11, 22, 12, 02, 01, with W the symmetric
+matrix of the weights of `stresslet` (off the diagonal: density times normal in both orders):
+    sigma = 4 delta tr(W)/r^3 + 6 (r (W r)^T + (W r) r^T)/r^5 - 60 r r^T (r.W r)/(2 r^7),
+W_ii twice the weight; its trace is -3 times the pressure.
+"""
+
+from __future__ import annotations
+
+from numba.extending import register_jitable
+
+from stokes.fmm.kernels import (
+    Kernel,
+    constant,
+    inverse_distance,
+    stokes_stress,
+    stokeslet,
+    stokeslet_pressure,
+    stresslet,
+    stresslet_pressure,
+)
+
+
+@register_jitable
+def _stresslet_stress(x, y, z, w):
+    two, six, sixty = constant(2.0, x), constant(6.0, x), constant(60.0, x)
+    inverse = inverse_distance(x * x + y * y + z * z)
+    inverse2 = inverse * inverse
+    inverse3 = inverse2 * inverse
+    inverse5 = six * (inverse3 * inverse2)
+    # v = W r, and r.W r = 2 (the form of the weights)
+    a = two * x * w[0] + y * w[5] + z * w[4]
+    b = x * w[5] + two * y * w[1] + z * w[3]
+    c = x * w[4] + y * w[3] + two * z * w[2]
+    form = constant(0.5, x) * (x * a + y * b + z * c)
+    trace = constant(4.0, x) * (w[0] + w[1] + w[2]) * inverse3
+    s = -sixty * form * (inverse3 * inverse2 * inverse2)
+    return (
+        trace + two * inverse5 * x * a + s * x * x,
+        trace + two * inverse5 * y * b + s * y * y,
+        trace + two * inverse5 * z * c + s * z * z,
+        inverse5 * (y * c + z * b) + s * y * z,
+        inverse5 * (x * c + z * a) + s * x * z,
+        inverse5 * (x * b + y * a) + s * x * y,
+    )
+
+
+stresslet_stress = Kernel("stresslet_stress", _stresslet_stress, 6, 6, degree=-3.0, parity=1)
+
+#: (single layer's kernel, double layer's kernel) of every quantity.
+LAYER_KERNELS = {
+    "velocity": (stokeslet, stresslet),
+    "pressure": (stokeslet_pressure, stresslet_pressure),
+    "stress": (stokes_stress, stresslet_stress),
+}
