@@ -104,7 +104,7 @@ def divide_panels(
         while depth > 0:
             depth -= 1
             a, b = stack[depth]
-            at_end = t == a or t == b
+            at_end = t in (a, b)
             rho = min(_least_rho(s[k], direct, a, b), _least_rho(s[k], mirrored, a, b))
             if not (at_end or np.isnan(t)):
                 rho = min(rho, _bernstein(complex(t), a, b))

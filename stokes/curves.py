@@ -12,7 +12,7 @@ trigonometric identities where there are, else as Gauss integrals of gamma' and 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,6 +28,9 @@ _MEAN_NODES, _MEAN_WEIGHTS = (
     (1 + np.polynomial.legendre.leggauss(16)[0]) / 2,
     np.polynomial.legendre.leggauss(16)[1] / 2,
 )
+
+_MOST_HALVINGS = 24
+_ROUND_OFF = 4e-15  # tails of a resolved series do not fall below this part of its greatest value
 
 
 @dataclass(frozen=True)
@@ -96,6 +99,23 @@ class Curve(ABC):
         step = (points.speed[:, :-1] * np.diff(s, axis=1)).max()
         return float(np.hypot(np.hypot(points.r, points.z).max(), step))
 
+    @cached_property
+    def polynomials(self) -> tuple[Array, Array]:
+        """Edges of panels, and the curve on them as Chebyshev series to round-off.
+
+        Coefficients (panels, 3, 2, 16): gamma, gamma', gamma'' by s; r, z; degrees 0 .. 15 in the
+        coordinate -1 .. 1 of a panel.
+        """
+        n = 16
+        edges = resolved_breaks(self, lambda points: np.stack([points.r, points.z]), n, 1e-15)
+        half = 0.5 * np.diff(edges)
+        x = np.cos(np.pi * (np.arange(n) + 0.5) / n)
+        points = self.evaluate(edges[:-1, None] + half[:, None] * (1 + x))
+        to_series = 2 / n * np.cos(np.pi * np.outer(np.arange(n), np.arange(n) + 0.5) / n)
+        to_series[0] /= 2
+        values = np.array([[points.r, points.z], [points.dr, points.dz], [points.d2r, points.d2z]])
+        return edges, np.ascontiguousarray(np.moveaxis(values @ to_series.T, 2, 0))
+
     def differences(self, s: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
         """Return (r(s) - r(t), z(s) - z(t)) to relative precision, also as s -> t."""
         s, t = np.broadcast_arrays(np.asarray(s, float), np.asarray(t, float))
@@ -142,6 +162,41 @@ class Curve(ABC):
         nodes = [t[:, None] + first * _MEAN_NODES, middle[:, None] + second * _MEAN_NODES]
         weights = [first * _MEAN_WEIGHTS, second * _MEAN_WEIGHTS]
         return np.concatenate(nodes, axis=1), np.concatenate(weights, axis=1)
+
+
+def resolved_breaks(
+    curve: Curve,
+    functions: Callable[[CurvePoints], Array],
+    nodes: int,
+    tolerance: float,
+) -> Array:
+    """Return edges of panels, halved until Gauss nodes resolve functions of the curve's points.
+
+    functions : CurvePoints of shape (m,) to (k, m). On each panel the two last of the `nodes`
+    Legendre coefficients must be below `tolerance` x the function's greatest value on the curve.
+    """
+    x, w = np.polynomial.legendre.leggauss(nodes)
+    # c_j = (2 j + 1)/2 sum w P_j f, for the two highest degrees
+    vandermonde = np.polynomial.legendre.legvander(x, nodes - 1)[:, -2:]
+    last = w[:, None] * vandermonde * (np.array([nodes - 2, nodes - 1]) + 0.5)
+    pending = np.column_stack([curve.breaks[:-1], curve.breaks[1:]])
+    done, largest = [], 0.0
+    for _ in range(_MOST_HALVINGS):
+        s = pending[:, :1] + 0.5 * np.diff(pending) * (1 + x)
+        points = curve.evaluate(s.ravel())
+        values = functions(points).reshape(-1, *s.shape)
+        largest = np.maximum(largest, np.abs(values).max(axis=(1, 2)))
+        tails = np.abs(values @ last).max(axis=2)
+        coarse = np.any(tails > np.maximum(tolerance, _ROUND_OFF) * largest[:, None], axis=0)
+        done.append(pending[~coarse])
+        a, b = pending[coarse].T
+        middle = 0.5 * (a + b)
+        pending = np.concatenate([np.column_stack([a, middle]), np.column_stack([middle, b])])
+        if len(pending) == 0:
+            break
+    else:
+        raise ValueError(f"{curve}: not resolved by {_MOST_HALVINGS} halvings of its panels")
+    return np.append(np.sort(np.concatenate(done)[:, 0]), 1.0)
 
 
 def _mirror(s: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:

@@ -23,16 +23,22 @@ from stokes.curves import (
     spheroid,
     spline_curve,
 )
+from stokes.distance import Gaps, close_pairs, distance, gaps, gaps_of_pairs
 from stokes.resolution import Resolution
 
 __all__ = [
     "Body",
     "Curve",
     "CurvePoints",
+    "Gaps",
     "Meridian",
     "Resolution",
     "SurfaceGrid",
+    "close_pairs",
+    "distance",
     "fourier_curve",
+    "gaps",
+    "gaps_of_pairs",
     "sphere",
     "spherocylinder",
     "spheroid",

@@ -6,8 +6,8 @@ and is needed only to change that table.
 The n-point rule on (0, 1) integrates x^k and x^k log x, k < n, exactly (a Gauss rule of a Chebyshev
 system: J. Ma, V. Rokhlin, S. Wandzura, SIAM J. Numer. Anal. 33, 1996). It is reached along the
 systems {x^k, x^(k + delta)}: delta = 1/2 is a Gauss-Jacobi rule in t = sqrt(x), delta -> 0 is the
-wanted one. Newton's method follows the path in the basis P_k(2x - 1), P_k(2x - 1) (x^delta - 1)/delta
-in long decimals, for the two halves of the basis are nearly dependent.
+wanted one. Newton's method follows the path in the basis P_k(2x - 1), P_k(2x - 1) (x^delta - 1)
+/delta, in long decimals, for the two halves of the basis are nearly dependent.
 """
 
 from __future__ import annotations
