@@ -152,10 +152,13 @@ class ShapeSolver:
         """B rho = (int rho, int x cross rho), (6[, m]): what the body exerts on the fluid."""
         return np.tensordot(self._weighted_motions, single_layer, axes=((0, 1, 2), (0, 1, 2)))
 
+    def mean_motion(self, field: Array) -> Array:
+        """Velocity and rotation (6[, m]) next to a field in the mean square over the surface."""
+        return np.linalg.solve(self._motion_gram, self.loads(field))
+
     def rigid_part(self, density: Array) -> Array:
-        """P q, the rigid motion next to q in the mean square over the surface."""
-        motion = np.linalg.solve(self._motion_gram, self.loads(density))
-        return np.tensordot(self.rigid_motions, motion, axes=1)
+        """P q, the field of q's mean motion."""
+        return np.tensordot(self.rigid_motions, self.mean_motion(density), axes=1)
 
     @cached_property
     def resistance(self) -> Array:
@@ -191,7 +194,7 @@ class ShapeSolver:
         inside = self.apply(carrier) - carrier  # P of a rigid motion is itself
         density = carrier + self.solve(field - inside)
         velocity = self._multiply(self.operators.matrices(Layer.SINGLE), density)
-        motion = np.linalg.solve(self._motion_gram, self.loads(velocity))
+        motion = self.mean_motion(velocity)
         return density, motion[:3], motion[3:]
 
     @cached_property
