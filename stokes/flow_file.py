@@ -400,9 +400,9 @@ def _read(file: h5py.File) -> Flow:
     group = _member(file, "surfaces", h5py.Group)
     names = ("grid", "position", "normal", "weight", "density")
     surfaces = Surfaces(**{name: _values(group, name) for name in names})
-    nodes = int(surfaces.offset[-1])
-    if len(surfaces.grid) != count or len(surfaces.position) != nodes:
-        raise ValueError("'surfaces' contradicts 'bodies'")
+    agree = np.array_equal(_values(group, "offset"), surfaces.offset)
+    if not agree or len(surfaces.grid) != count or len(surfaces.position) != surfaces.offset[-1]:
+        raise ValueError("'surfaces' contradicts itself or 'bodies'")
     values = _read_field(file) if "field" in file else None
     return Flow(bodies, surfaces, attributes, values)
 
