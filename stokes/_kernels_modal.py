@@ -69,8 +69,10 @@ def new_workspace(n_max):
 
 @jit
 def _moments_near(d2, p, m_max, excess, n_max, even, odd):
-    """Moments in v = 1 - cos t, of degree up to m + excess in even[:, m], one less in odd[:, m]."""
-    fill_toroidal(d2, p, n_max + 1, m_max, _PAD, even[0])
+    """Moments in v = 1 - cos t, of degree up to m + excess in even[:, m], one less in odd[:, m].
+
+    From even[0, m], the toroidal sequences up to n_max + 1.
+    """
     half = 0.5 / p
     for k in range(1, m_max + excess + 1):
         for m in range(max(0, k - excess), m_max + 1):
@@ -105,9 +107,11 @@ def _moments_near(d2, p, m_max, excess, n_max, even, odd):
 
 
 @jit
-def _moments_far(d2, p, m_max, degrees, n_max, even, odd):
-    """Moments in v = cos t, of degree up to degrees[m]: means over neighbouring modes."""
-    fill_toroidal(d2, p, n_max + _PAD, m_max, _PAD, even[0])
+def _moments_far(m_max, degrees, n_max, even, odd):
+    """Moments in v = cos t, of degree up to degrees[m]: means over neighbouring modes.
+
+    From even[0, m], the toroidal sequences up to n_max + 4.
+    """
     for m in range(m_max + 1):
         degree = degrees[m]
         if degree < 1:
@@ -306,52 +310,50 @@ def _add_traction_double(coefficients, first, target, source, dz, basis, dyad):
 def _fill_coefficients(kind, near, target, source, dr, dz, offsets, coefficients):
     """Write the polynomials of this kernel; of stresses, both tractions and then the pressure."""
     r, r_source = target[0], source[0]
-    basis = _basis(near, target, source, dr, dz, offsets[0], offsets[1])
-    a, b, cosine, sine2, projection, projection_source = basis
-    if kind == PRESSURE_SINGLE:
-        _add_pressure_single(coefficients, 0, r, dz, b)
-        return
-    if kind == PRESSURE_DOUBLE:
-        _add_pressure_double(coefficients, 0, r, dz, b, source, projection_source)
-        return
-    dyad = _dyad(a, b, sine2, r, r_source, dz)
-    if kind == VELOCITY_SINGLE:
-        _add_velocity_single(coefficients, dyad, cosine)
-    elif kind == TRACTION_SINGLE:
-        _add_stresslet(coefficients, 0, -6.0 * _PER_8_PI, dyad, projection)
-    elif kind == VELOCITY_DOUBLE:
-        _add_stresslet(coefficients, 0, 6.0 * _PER_8_PI, dyad, projection_source)
-    elif kind == TRACTION_DOUBLE:
-        _add_traction_double(coefficients, 0, target, source, dz, basis, dyad)
-    else:
-        for axis in range(2):
-            normal = (r, 1.0 - axis, 1.0 * axis)
-            offset = dz if axis == 1 else dr
-            turned = _basis(near, normal, source, dr, dz, offset, offsets[1])
-            if kind == STRESS_SINGLE:
-                _add_stresslet(coefficients, 9 * axis, -6.0 * _PER_8_PI, dyad, turned[4])
+    stress = kind in (STRESS_SINGLE, STRESS_DOUBLE)
+    first_of_pressure = 18 if stress else 0
+    for plane in range(2 if stress else 1):
+        normal, offset = target, offsets[0]
+        if stress:  # planes across r, then across z
+            normal = (r, 1.0 - plane, 1.0 * plane)
+            offset = dr if plane == 0 else dz
+        basis = _basis(near, normal, source, dr, dz, offset, offsets[1])
+        a, b, cosine, sine2, projection, projection_source = basis
+        first = 9 * plane
+        if kind not in (PRESSURE_SINGLE, PRESSURE_DOUBLE):
+            dyad = _dyad(a, b, sine2, r, r_source, dz)
+            if kind == VELOCITY_SINGLE:
+                _add_velocity_single(coefficients, dyad, cosine)
+            elif kind == VELOCITY_DOUBLE:
+                _add_stresslet(coefficients, first, 6.0 * _PER_8_PI, dyad, projection_source)
+            elif kind in (TRACTION_SINGLE, STRESS_SINGLE):
+                _add_stresslet(coefficients, first, -6.0 * _PER_8_PI, dyad, projection)
             else:
-                _add_traction_double(coefficients, 9 * axis, normal, source, dz, turned, dyad)
-        if kind == STRESS_SINGLE:
-            _add_pressure_single(coefficients, 18, r, dz, b)
-        else:
-            _add_pressure_double(coefficients, 18, r, dz, b, source, projection_source)
+                _add_traction_double(coefficients, first, normal, source, dz, basis, dyad)
+        if plane > 0:
+            continue
+        if kind in (PRESSURE_SINGLE, STRESS_SINGLE):
+            _add_pressure_single(coefficients, first_of_pressure, r, dz, b)
+        elif kind in (PRESSURE_DOUBLE, STRESS_DOUBLE):
+            _add_pressure_double(
+                coefficients, first_of_pressure, r, dz, b, source, projection_source
+            )
 
 
 @jit
-def _is_odd(entry, pressure):
+def _parity(entry, first_of_pressure):
     """Whether the entry holds a factor sin t, and the sign it takes in the real form."""
     column = entry % 3
-    row = 0 if pressure else (entry // 3) % 3
+    row = 0 if entry >= first_of_pressure else (entry // 3) % 3
     odd = (row == 1) != (column == 1)
     return odd, (-1.0 if odd and row == 1 else 1.0)
 
 
 @jit
-def _combine(first, count, pressure, m_max, n_max, even, odd, coefficients, modes):
+def _combine(count, first_of_pressure, m_max, n_max, even, odd, coefficients, modes):
     """Write to `modes[entry, n]` the sums of coefficients times moments."""
-    for entry in range(first, first + count):
-        is_odd, sign = _is_odd(entry - first, pressure)
+    for entry in range(count):
+        is_odd, sign = _parity(entry, first_of_pressure)
         row = modes[entry]
         row[:] = 0.0
         for m in range(m_max + 1):
@@ -392,25 +394,21 @@ def modal_modes(kind, target, source, dr, dz, offsets, n_max, workspace, out):
     p = target[0] * source[0]
     near = d2 < 4.0 * p
     m_max = _HIGHEST_ORDER_OF[kind]
+    fill_toroidal(d2, p, n_max + (1 if near else _PAD), m_max, _PAD, even[0])
     if near:
         _moments_near(d2, p, m_max, _DEGREE[kind, m_max] - m_max, n_max, even, odd)
     else:
-        _moments_far(d2, p, m_max, _DEGREE[kind], n_max, even, odd)
-    stress = kind in (STRESS_SINGLE, STRESS_DOUBLE)
+        _moments_far(m_max, _DEGREE[kind], n_max, even, odd)
     rows = ROWS[kind]
-    count = 21 if stress else 3 * rows
-    for m in range(m_max + 1):
-        for entry in range(count):
-            for k in range(_MAX_DEGREE + 1):
-                coefficients[m, entry, k] = 0.0
+    # stresses: the tractions on two planes, then the pressure
+    count = 21 if rows == 6 else 3 * rows
+    first_of_pressure = 0 if rows == 1 else 3 * rows
+    coefficients[: m_max + 1, :count] = 0.0
     _fill_coefficients(kind, near, target, source, dr, dz, offsets, coefficients)
-    if stress:
-        _combine(0, 9, False, m_max, n_max, even, odd, coefficients, modes)
-        _combine(9, 9, False, m_max, n_max, even, odd, coefficients, modes)
-        _combine(18, 3, True, m_max, n_max, even, odd, coefficients, modes)
+    _combine(count, first_of_pressure, m_max, n_max, even, odd, coefficients, modes)
+    if rows == 6:
         _collect_stress(n_max, modes, out)
         return
-    _combine(0, count, rows == 1, m_max, n_max, even, odd, coefficients, modes)
     for n in range(n_max + 1):
         for i in range(rows):
             for j in range(3):

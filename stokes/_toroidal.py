@@ -177,7 +177,7 @@ def toroidal_table(d2: np.ndarray, p: np.ndarray, n_max: int, m_max: int) -> np.
         raise ValueError(f"d2 and p must be vectors of one length, not {d2.shape} and {p.shape}")
     if not 0 <= m_max <= HIGHEST_ORDER or n_max < 0:
         raise ValueError(f"order {m_max} is not in 0..{HIGHEST_ORDER}, or degree {n_max} < 0")
-    if np.any(d2 <= 0.0) or np.any(p < 0.0):
+    if not (np.all(d2 > 0.0) and np.all(p >= 0.0)):
         raise ValueError("distances must be positive and products of radii not negative")
     out = np.empty((d2.size, m_max + 1, n_max + 1))
     _toroidal_table(d2, p, out)
