@@ -21,16 +21,15 @@ SINGLE, DOUBLE, TRACTION = 0, 1, 2
 
 
 @jit_threads
-def plain_modes(layer, target, source, weight, cosine, sine, out):
+def plain_modes(layer, target, source, weight, step, cosine, sine, out):
     """out[n, i + c n_t, j + d n_s] = (R_cd)_n between target i and source j, times weight[j].
 
     target, source : (n_t, 4), (n_s, 4) r, z, nu_r, nu_z;  weight : (n_s,) length r speed of j
-    cosine, sine   : (n_theta // 2 + 1, modes + 1) cos(n t_l), sin(n t_l) times 2 pi / n_theta, and
-                     twice that for l > 0 (l and -l at once; n_theta is odd)
+    cosine, sine   : (n_theta // 2 + 1, modes + 1) cos(n t_l), sin(n t_l) times `step` = 2 pi /
+                     n_theta, twice that where -t_l is another azimuth than t_l
     """
     n_t, n_s = target.shape[0], source.shape[0]
     n_modes = cosine.shape[1]
-    step = 2.0 * math.pi / (2 * cosine.shape[0] - 1)
     for i in prange(n_t):
         block = np.empty(9)
         total = np.empty((9, n_modes))

@@ -15,7 +15,6 @@ Units are the caller's: velocity U, length L and viscosity v make forces v U L.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

@@ -40,6 +40,9 @@ from stokes.operators import Layer, ModalOperators
 
 Array = NDArray[np.float64]
 
+DEFAULT_ETA = 1.5
+"""Best conditioned on spheres, and next to it on other shapes; see `ShapeSolver`."""
+
 
 class Formulation(StrEnum):
     """Which integral equation; see the head of this module."""
@@ -79,7 +82,7 @@ class ShapeSolver:
         self,
         operators: ModalOperators,
         formulation: Formulation | str = Formulation.COMBINED,
-        eta: float = 1.0,
+        eta: float = DEFAULT_ETA,
     ) -> None:
         self.operators = operators
         self.formulation = Formulation(formulation)
@@ -89,7 +92,7 @@ class ShapeSolver:
         layers = {kind: operators.matrices(kind) for kind in _KINDS[self.formulation]}
         self.matrices = self._compose(layers)
         self._add_identity_and_lift()
-        self._corrections: dict[Resolution | None, Array] = {}
+        self._corrections: dict[tuple[int, int], Array] = {}
 
     # ---- the operator ------------------------------------------------------------------------
 
@@ -109,21 +112,30 @@ class ShapeSolver:
                 rows[:] = solution.T
         return from_modes(coefficients, self.grid.shape[1], np.shape(field)[3:])
 
-    def smooth_self(self, density: Array, sources: Resolution | None = None) -> Array:
+    def smooth_self(self, density: Array, refinement: tuple[int, int] = (1, 1)) -> Array:
         """What a sum over surface nodes, own node left out, gives at the nodes: the plain rule.
 
         Of the layers alone, without identity and rank-one terms: what a fast summation over all
-        sources adds up of this body itself, (n_s, n_theta, 3[, m]). `sources` are the nodes that
-        the density is interpolated to before summing (same panels, an odd multiple of the
-        azimuths); None: the nodes themselves.
+        sources adds up of this body itself, (n_s, n_theta, 3[, m]). The sources may be refined:
+        so many times the azimuths and the Gauss nodes of panels, the density interpolated.
         """
-        return self._multiply(self._plain(sources), density)
+        return self._multiply(self._plain(refinement), density)
 
-    def self_correction(self, density: Array, sources: Resolution | None = None) -> Array:
+    def self_correction(self, density: Array, refinement: tuple[int, int] = (1, 1)) -> Array:
         """`apply` minus `smooth_self`, by one product with matrices that are kept."""
-        if sources not in self._corrections:
-            self._corrections[sources] = self.matrices - self._plain(sources)
-        return self._multiply(self._corrections[sources], density)
+        refinement = tuple(refinement)
+        if refinement not in self._corrections:
+            self._corrections[refinement] = self.matrices - self._plain(refinement)
+        return self._multiply(self._corrections[refinement], density)
+
+    @property
+    def coefficients(self) -> tuple[float, float]:
+        """(a, b) of the unit shape's flow a S f + b D q; f = q, but P q if `completed`."""
+        if self.formulation is Formulation.INTERIOR:
+            return 0.0, 1.0
+        if self.formulation in (Formulation.SINGLE, Formulation.TRACTION):
+            return 1.0, 0.0
+        return self.eta / self.length, 1.0
 
     def layers(
         self, density: Array, scale: float = 1.0, viscosity: float = 1.0
@@ -132,14 +144,9 @@ class ShapeSolver:
 
         Local Cartesian components; u = S rho / viscosity + D mu.
         """
-        if self.formulation is Formulation.INTERIOR:
-            return None, density
-        if self.formulation in (Formulation.SINGLE, Formulation.TRACTION):
-            return viscosity / scale * density, None
-        factor = self.eta * viscosity / (self.length * scale)
-        if self.formulation is Formulation.COMBINED:
-            return factor * density, density
-        return factor * self.rigid_part(density), density
+        a, b = self.coefficients
+        rho = self.rigid_part(density) if self.formulation is Formulation.COMPLETED else density
+        return a * viscosity / scale * rho if a else None, density if b else None
 
     # ---- rigid motions and loads -------------------------------------------------------------
 
@@ -247,15 +254,15 @@ class ShapeSolver:
         meridian = self.operators.meridian
         return np.tile(meridian.weights * meridian.r, 3)
 
-    def _plain(self, sources: Resolution | None) -> Array:
+    def _plain(self, refinement: tuple[int, int]) -> Array:
         kinds = _KINDS[self.formulation]
-        return self._compose({kind: self.operators.plain(kind, sources) for kind in kinds})
+        return self._compose({kind: self.operators.plain(kind, refinement) for kind in kinds})
 
     def _compose(self, layers: dict[Layer, Array]) -> Array:
         """The layers of this formulation, without identity and lift."""
         if self.formulation in (Formulation.SINGLE, Formulation.INTERIOR, Formulation.TRACTION):
             return layers[_KINDS[self.formulation][0]].copy()
-        single = self.eta / self.length * layers[Layer.SINGLE]
+        single = self.coefficients[0] * layers[Layer.SINGLE]
         if self.formulation is Formulation.COMBINED:
             return single + layers[Layer.DOUBLE]
         total = layers[Layer.DOUBLE].copy()
@@ -320,7 +327,7 @@ class OperatorCache:
         curve: Curve,
         resolution: Resolution,
         formulation: Formulation | str = Formulation.COMBINED,
-        eta: float = 1.0,
+        eta: float = DEFAULT_ETA,
     ) -> ShapeSolver:
         """The solver of this shape at this resolution; `eta` as for `ShapeSolver`."""
         key = (curve, resolution, Formulation(formulation), float(eta))

@@ -19,7 +19,9 @@ Symbols: n_s nodes of the meridian, M modes; matrices (M + 1, 3 n_s, 3 n_s).
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +32,13 @@ from stokes._kernels_plain import plain_modes
 from stokes.fmm._threads import limited_threads
 from stokes.geometry import Curve, Meridian, Resolution, SurfaceGrid
 from stokes.modal import KINDS
-from stokes.quadrature import gauss_legendre, interpolation_matrix, self_rule
+from stokes.quadrature import PanelRule, gauss_legendre, interpolation_matrix, self_rule
 
 Array = NDArray[np.float64]
+
+# Nodes closer than this, relative to the body, take their differences from the curve: those of
+# their coordinates would lose two digits or more.
+_CLOSE = 0.1
 
 
 class Layer(StrEnum):
@@ -78,30 +84,31 @@ class ModalOperators:
             self._matrices[layer] = matrices
         return self._matrices[layer]
 
-    def plain(self, layer: Layer | str, sources: Resolution | None = None) -> Array:
+    def plain(self, layer: Layer | str, refinement: tuple[int, int] = (1, 1)) -> Array:
         """The same of the plain product rule with the term x = x' left out, (modes + 1, ...).
 
-        `sources` are nodes to which densities are first interpolated: the same panels with other
-        Gauss nodes, an odd multiple of the azimuths. Raises ValueError for others.
+        refinement : so many times the azimuths, so many times the Gauss nodes of each panel, to
+        which densities are first interpolated
         """
-        layer, sources = Layer(layer), sources or self.resolution
-        meridian = Meridian(self.curve, sources)
-        cosine, sine = self._transform(sources)
-        size, n_s = 3 * self.meridian.size, meridian.size
-        plain = np.empty((self.resolution.modes + 1, size, 3 * n_s))
+        azimuth, nodes = refinement[0], refinement[1] * self.resolution.nodes
+        fine = Meridian(self.curve, replace(self.resolution, nodes=nodes))
+        cosine, sine = self._transform(azimuth * self.resolution.angles)
+        size = 3 * self.meridian.size
+        plain = np.empty((self.resolution.modes + 1, size, 3 * fine.size))
         with limited_threads(self.threads):
             plain_modes.using(self.threads)(
-                _PLAIN[layer],
+                _PLAIN[Layer(layer)],
                 _node_table(self.meridian),
-                _node_table(meridian),
-                meridian.weights * meridian.r,
+                _node_table(fine),
+                fine.weights * fine.r,
+                2.0 * math.pi / (azimuth * self.resolution.angles),
                 cosine,
                 sine,
                 plain,
             )
-        if sources == self.resolution:
+        if refinement[1] == 1:
             return plain
-        return plain @ np.kron(np.eye(3), self._panel_interpolation(sources.nodes))
+        return plain @ np.kron(np.eye(3), self._panel_interpolation(nodes))
 
     @property
     def nbytes(self) -> int:
@@ -109,22 +116,21 @@ class ModalOperators:
         return sum(matrices.nbytes for matrices in self._matrices.values())
 
     def release(self) -> None:
-        """Forget the matrices; they are assembled again if asked for."""
+        """Forget the matrices and what they are made of; they are made again if asked for."""
         self._matrices.clear()
+        for name in ("_rule", "_separations"):
+            self.__dict__.pop(name, None)
 
     def _assembled(self, layer: Layer) -> Array:
-        meridian = self.meridian
-        N = meridian.size
-        rule = self_rule(meridian)
-        s, t = np.meshgrid(meridian.s, meridian.s, indexing="ij")
+        N = self.meridian.size
+        rule = self._rule
         matrices = np.empty((self.resolution.modes + 1, 3 * N, 3 * N))
         with limited_threads(self.threads):
             assemble.using(self.threads)(
                 KINDS[_KERNEL[layer]],
-                _node_table(meridian),
-                meridian.weights * meridian.r,
-                np.stack(self.curve.differences(s, t), axis=-1),
-                np.stack(self.curve.normal_offsets(s, t), axis=-1),
+                _node_table(self.meridian),
+                self.meridian.weights * self.meridian.r,
+                *self._separations,
                 self.resolution.nodes,
                 np.searchsorted(rule.pairs[:, 0], np.arange(N + 1)),
                 (
@@ -140,19 +146,39 @@ class ModalOperators:
             )
         return matrices
 
-    def _transform(self, sources: Resolution) -> tuple[Array, Array]:
-        """Tables of `plain_modes` for the azimuths of `sources`."""
-        ratio, rest = divmod(sources.angles, self.resolution.angles)
-        if sources.breaks != self.resolution.breaks or rest or ratio % 2 == 0:
-            raise ValueError(
-                f"sources {sources}: need the panels of {self.resolution} and an odd multiple "
-                "of its azimuths"
-            )
-        step = 2.0 * math.pi / sources.angles
-        t = step * np.arange(sources.modes + 1)
-        angle = t[:, None] * np.arange(self.resolution.modes + 1)
-        weight = np.where(t == 0.0, step, 2.0 * step)[:, None]
-        return weight * np.cos(angle), weight * np.sin(angle)
+    @cached_property
+    def _rule(self) -> PanelRule:
+        return self_rule(self.meridian)
+
+    @cached_property
+    def _separations(self) -> tuple[Array, Array]:
+        """Differences and normal offsets between nodes, (n_s, n_s, 2) each.
+
+        Far apart, those of the coordinates have all the digits there are.
+        """
+        nodes, s = _node_table(self.meridian), self.meridian.s
+        difference = nodes[:, None, :2] - nodes[None, :, :2]
+        offsets = np.stack(
+            [
+                np.einsum("...k,...k", side, difference)
+                for side in (nodes[:, None, 2:], nodes[None, :, 2:])
+            ],
+            axis=-1,
+        )
+        distance = np.hypot(difference[..., 0], difference[..., 1])
+        i, j = np.nonzero(distance < _CLOSE * self.curve.bounding_radius)
+        difference[i, j] = np.column_stack(self.curve.differences(s[i], s[j]))
+        offsets[i, j] = np.column_stack(self.curve.normal_offsets(s[i], s[j]))
+        return difference, offsets
+
+    def _transform(self, angles: int) -> tuple[Array, Array]:
+        """Tables of `plain_modes` for so many azimuths."""
+        step = 2.0 * math.pi / angles
+        k = np.arange(angles // 2 + 1)
+        phase = step * k[:, None] * np.arange(self.resolution.modes + 1)
+        alone = (k == 0) | (2 * k == angles)  # else theta and -theta at once
+        weight = step * np.where(alone, 1.0, 2.0)[:, None]
+        return weight * np.cos(phase), weight * np.sin(phase)
 
     def _panel_interpolation(self, nodes: int) -> Array:
         """From the nodes of the meridian to `nodes` Gauss nodes of each panel."""
