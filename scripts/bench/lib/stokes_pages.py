@@ -9,8 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stokes.exact import two_spheres_axial, two_spheres_spinning
-
 
 class DeRow(NamedTuple):
     """S. De, PhD thesis 2021, Table 3.1, all seconds of one run; no error where none converged."""
@@ -56,6 +54,8 @@ def gap_error(task: dict[str, Any], row: dict[str, Any]) -> float | None:
     """Of loads on spheres that move, relative; of a known flow, the largest at any point."""
     if "error_to_largest" in row:
         return max(row["error_to_largest"].values())
+    from stokes.exact import two_spheres_axial, two_spheres_spinning
+
     name, arguments = task["scene"]
     if name != "pair" or tuple(arguments["semi_axes"]) != (1.0, 1.0):
         return None
