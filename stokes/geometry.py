@@ -24,7 +24,7 @@ from stokes.curves import (
     spline_curve,
 )
 from stokes.distance import Gaps, close_pairs, distance, gaps, gaps_of_pairs
-from stokes.resolution import Resolution
+from stokes.resolution import Resolution, ResolutionLadder, resolution_for
 
 __all__ = [
     "Body",
@@ -33,12 +33,14 @@ __all__ = [
     "Gaps",
     "Meridian",
     "Resolution",
+    "ResolutionLadder",
     "SurfaceGrid",
     "close_pairs",
     "distance",
     "fourier_curve",
     "gaps",
     "gaps_of_pairs",
+    "resolution_for",
     "sphere",
     "spherocylinder",
     "spheroid",
