@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -123,6 +123,13 @@ class FrameBodies:
     def __len__(self) -> int:
         return len(self.gid)
 
+    def take(self, rows: NDArray) -> FrameBodies:
+        """These rows alone, of every column."""
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(
+            self, **{k: v[rows] for k, v in columns.items() if isinstance(v, np.ndarray)}
+        )
+
     @property
     def volume(self) -> NDArray:
         """(n,) [m^3] of the bodies as they are in the run."""
@@ -221,8 +228,8 @@ def read_bodies(path: Path, frame: str, selection: Selection, moving: bool) -> F
         index = read_index(path, file)
         k = find_frame(index, frame, path)
         scene = _scene_facts(path, file)
-        fields = _fields_to_read(path, read_fields(path, file), scene, moving)
-        columns = _selected_rows(path, file, fields, index, k, selection)
+        wanted = _fields_to_read(path, read_fields(path, file), scene, moving)
+        columns = _selected_rows(path, file, wanted, index, k, selection)
     columns = {name: rows[np.argsort(columns["gid"])] for name, rows in columns.items()}
     _check_selection(path, k, selection, columns["gid"])
     _check_columns(path, columns)
@@ -382,8 +389,8 @@ class Shrinkage:
     """By what factor the bodies are smaller than in the run, and what decides it.
 
     factor : of all lengths, about each body's own centre
-    gap    : least gap at that factor, in radii of the smaller body of that pair; infinite for one
-             body or bodies far apart
+    gap    : least gap at that factor, in radii of the smaller body of that pair; infinite where
+             no bodies are nearer than a radius of the largest
     pair   : gids of the bodies that have it, empty where there are none
     """
 
@@ -395,14 +402,13 @@ class Shrinkage:
 def shrinkage(bodies: FrameBodies, factor: float | None = None) -> Shrinkage:
     """The largest factor <= 1 that leaves `LEAST_GAP` between all bodies, or the one that is given.
 
-    Exact for spheres; for other bodies by bisection with `stokes.geometry.gaps`, to 1e-9 and from
+    Exact for spheres; for other bodies by bisection with `stokes.distance`, to 1e-9 and from
     below. Raises InputError where bodies touch at the factor that is given, or overlap so much
     that next to nothing would be left of them.
     """
-    a, b = _near_pairs(bodies)
+    pairs = _near_pairs(bodies)
     if factor is not None:
-        gap = _relative_gaps(bodies, a, b, factor)
-        found = _least(bodies, a, b, factor, gap)
+        found = _least(bodies, pairs, factor)
         if found.gap <= 0.0:
             best = shrinkage(bodies).factor
             raise InputError(
@@ -412,10 +418,10 @@ def shrinkage(bodies: FrameBodies, factor: float | None = None) -> Shrinkage:
             )
         return found
     if not bodies.shape.any():
-        best = _sphere_factor(bodies, a, b)
+        best = _sphere_factor(bodies, pairs)
     else:
-        best = _bisected_factor(bodies, a, b)
-    found = _least(bodies, a, b, best, _relative_gaps(bodies, a, b, best))
+        best = _bisected_factor(bodies, pairs)
+    found = _least(bodies, pairs, best)
     if found.factor < _SMALLEST_FACTOR:
         raise InputError(
             f"--hydrodynamic-radius auto: bodies {found.pair[0]} and {found.pair[1]} overlap so "
@@ -424,85 +430,67 @@ def shrinkage(bodies: FrameBodies, factor: float | None = None) -> Shrinkage:
     return found
 
 
-def _least(bodies: FrameBodies, a: NDArray, b: NDArray, factor: float, gap: NDArray) -> Shrinkage:
-    if not len(gap):
+def _least(bodies: FrameBodies, pairs: NDArray, factor: float) -> Shrinkage:
+    if not len(pairs):
         return Shrinkage(factor)
+    gap = _relative_gaps(bodies, pairs, factor)
     k = int(np.argmin(gap))
-    return Shrinkage(factor, float(gap[k]), (int(bodies.gid[a[k]]), int(bodies.gid[b[k]])))
+    return Shrinkage(factor, float(gap[k]), tuple(bodies.gid[pairs[k]].tolist()))
 
 
-def _near_pairs(bodies: FrameBodies) -> tuple[NDArray, NDArray]:
-    """Rows (k,), (k,) of pairs whose bounding spheres come close: all that may have the least gap.
+def _near_pairs(bodies: FrameBodies) -> NDArray:
+    """Rows (k, 2) of all pairs whose bounding spheres are nearer than the largest radius."""
+    from stokes.distance import close_pairs
 
-    Sizes are grouped by powers of two, for a tree that looks as far as the largest body reaches
-    finds too much where there are many small ones.
-    """
-    from scipy.spatial import cKDTree
-
-    reach = (1.0 + LEAST_GAP) * shapes.bounding_radius(
-        bodies.shape, bodies.radius, bodies.half_length
-    )
-    level = np.frexp(reach)[1]
-    rows = [np.flatnonzero(level == k) for k in np.unique(level)]
-    trees = [cKDTree(bodies.position[r]) for r in rows]
-    found = [np.zeros((0, 2), dtype=np.int64)]
-    for i in range(len(rows)):
-        for j in range(i + 1):
-            most = reach[rows[i]].max() + reach[rows[j]].max()
-            near = trees[i].sparse_distance_matrix(trees[j], most, output_type="ndarray")
-            pairs = np.stack([rows[i][near["i"]], rows[j][near["j"]]], axis=1)
-            pairs = pairs[near["v"] <= reach[pairs].sum(axis=1)]
-            found.append(pairs[pairs[:, 0] < pairs[:, 1]] if i == j else np.sort(pairs, axis=1))
-    pairs = np.unique(np.concatenate(found), axis=0)
-    return pairs[:, 0], pairs[:, 1]
+    return close_pairs(stokes_bodies(bodies), float(bodies.radius.max()))
 
 
-def _pair_size(bodies: FrameBodies, a: NDArray, b: NDArray) -> NDArray:
+def _pair_size(bodies: FrameBodies, pairs: NDArray) -> NDArray:
     """What a gap is counted in, (k,) [m]: the lesser half width of the two bodies."""
     size = shapes.smallest_size(bodies.shape, bodies.radius, bodies.half_length)
-    return np.minimum(size[a], size[b])
+    return size[pairs].min(axis=1)
 
 
-def _distance(bodies: FrameBodies, a: NDArray, b: NDArray) -> NDArray:
-    return np.linalg.norm(bodies.position[a] - bodies.position[b], axis=1)
+def _distance(bodies: FrameBodies, pairs: NDArray) -> NDArray:
+    """(k,) [m] between the centres."""
+    return np.linalg.norm(np.diff(bodies.position[pairs], axis=1)[:, 0], axis=1)
 
 
-def _sphere_factor(bodies: FrameBodies, a: NDArray, b: NDArray) -> float:
+def _sphere_factor(bodies: FrameBodies, pairs: NDArray) -> float:
     """d - f (r_a + r_b) = LEAST_GAP f min(r_a, r_b), solved for f."""
-    reach = bodies.radius[a] + bodies.radius[b] + LEAST_GAP * _pair_size(bodies, a, b)
-    return float(np.min(_distance(bodies, a, b) / reach, initial=1.0))
+    reach = bodies.radius[pairs].sum(axis=1) + LEAST_GAP * _pair_size(bodies, pairs)
+    return float(np.min(_distance(bodies, pairs) / reach, initial=1.0))
 
 
-def _bisected_factor(bodies: FrameBodies, a: NDArray, b: NDArray) -> float:
+def _bisected_factor(bodies: FrameBodies, pairs: NDArray) -> float:
     """The same for any shapes: gaps fall as the factor rises, for bodies are convex."""
-    tight = _relative_gaps(bodies, a, b, 1.0) < LEAST_GAP
-    if not tight.any():
+    pairs = pairs[_relative_gaps(bodies, pairs, 1.0) < LEAST_GAP]
+    if not len(pairs):
         return 1.0
-    a, b = a[tight], b[tight]
     reach = shapes.bounding_radius(bodies.shape, bodies.radius, bodies.half_length)
     # Bounding spheres that far apart leave room enough.
-    room = reach[a] + reach[b] + LEAST_GAP * _pair_size(bodies, a, b)
-    low, high = float(np.min(_distance(bodies, a, b) / room)), 1.0
+    room = reach[pairs].sum(axis=1) + LEAST_GAP * _pair_size(bodies, pairs)
+    low, high = float(np.min(_distance(bodies, pairs) / room)), 1.0
     while high - low > _FACTOR_ERROR * high:
         middle = 0.5 * (low + high)
-        tight = _relative_gaps(bodies, a, b, middle) < LEAST_GAP
+        tight = _relative_gaps(bodies, pairs, middle) < LEAST_GAP
         if tight.any():
             # The others have room at `middle`, and so at every factor below it.
-            high, a, b = middle, a[tight], b[tight]
+            high, pairs = middle, pairs[tight]
         else:
             low = middle
     return low
 
 
-def _relative_gaps(bodies: FrameBodies, a: NDArray, b: NDArray, factor: float) -> NDArray:
+def _relative_gaps(bodies: FrameBodies, pairs: NDArray, factor: float) -> NDArray:
     """Gaps (k,) of pairs of bodies, in radii of the smaller one; negative where they overlap."""
-    size = factor * _pair_size(bodies, a, b)
+    size = factor * _pair_size(bodies, pairs)
     if not bodies.shape.any():
-        return (_distance(bodies, a, b) - factor * (bodies.radius[a] + bodies.radius[b])) / size
-    from stokes.geometry import gaps
+        return (_distance(bodies, pairs) - factor * bodies.radius[pairs].sum(axis=1)) / size
+    from stokes.distance import gaps_of_pairs
 
-    every = stokes_bodies(bodies, factor)
-    return gaps([every[i] for i in a], [every[i] for i in b]) / size
+    rows, among = np.unique(pairs, return_inverse=True)
+    return gaps_of_pairs(stokes_bodies(bodies.take(rows), factor), among).distance / size
 
 
 # ---- what is handed over -------------------------------------------------------------------

@@ -310,3 +310,62 @@ def test_bodies_at_one_place_are_refused(tmp_path):
     bodies = handed(tmp_path, columns_of([[0, 0, 0], [0, 1e-9, 0]], 0.1, gid=[4, 9]))
     with pytest.raises(InputError, match=r"bodies 4 and 9 overlap so far"):
         shrinkage(bodies)
+
+
+# Exact factors of two equal bodies, the second 0.15 m away along x from the first, whose axis is z
+# unless it is turned: the gap along x is 0.15 - f w, w the sum of half widths, and shall be
+# 0.01 f s with s the lesser half width.
+TURNED = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # the axis along x
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "half_length", "orientation", "width", "size"),
+    [
+        ("spheroid", 0.2, (UPRIGHT, UPRIGHT), 0.2, 0.1),
+        ("spheroid", 0.05, (TURNED, TURNED), 0.1, 0.05),
+        ("spheroid", 0.02, (TURNED, UPRIGHT), 0.12, 0.02),
+        ("spherocylinder", 0.3, (UPRIGHT, UPRIGHT), 0.2, 0.1),
+        ("spherocylinder", 0.08, (UPRIGHT, TURNED), 0.28, 0.1),
+    ],
+)
+def test_other_shapes_shrink_to_the_same_gap(
+    tmp_path, shape, half_length, orientation, width, size
+):
+    columns = columns_of(
+        [[0, 0, 0], [0.15, 0, 0], [5, 5, 5]], 0.1, shape, half_length, (*orientation, UPRIGHT)
+    )
+    bodies = handed(tmp_path, columns)
+    found = shrinkage(bodies)
+    expected = min(1.0, 0.15 / (width + LEAST_GAP * size))
+    # Gaps are found to about 1e-10 of a size, the factor to 1e-9.
+    assert found.factor == pytest.approx(expected, rel=1e-8)
+    if expected < 1.0:
+        assert found.gap == pytest.approx(LEAST_GAP, rel=1e-5) and found.gap >= LEAST_GAP
+        assert found.pair == (0, 1)
+
+
+def test_bodies_of_one_aspect_ratio_share_their_curve(tmp_path):
+    radius = np.array([0.1, 0.3, 0.07, 0.1, 0.2])
+    shape = ["spheroid", "spheroid", "spheroid", "sphere", "sphere"]
+    columns = columns_of(np.eye(5, 3) * 9, radius, shape, np.where(np.arange(5) < 3, 3 * radius, 0))
+    made = stokes_bodies(handed(tmp_path, columns), 0.5)
+    assert len({body.curve for body in made[:3]}) == 1
+    assert len({body.curve for body in made}) == 2
+    assert [body.scale for body in made] == (0.5 * radius).tolist()
+
+
+def test_surfaces_of_the_bodies_are_where_the_run_has_them(tmp_path):
+    columns = cloud(6, shape=["sphere", "spheroid", "spherocylinder"] * 2, half_length=0.08)
+    bodies = handed(tmp_path, columns)
+    for i, body in enumerate(stokes_bodies(bodies)):
+        tip = bodies.half_length[i] + (bodies.radius[i] if bodies.shape[i] == 1 else 0.0)
+        tip = tip if bodies.shape[i] else bodies.radius[i]
+        w, x, y, z = bodies.orientation[i]
+        axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+        points = body.curve.evaluate(np.array([0.0, 0.5]))
+        north, equator = body.to_world(np.stack([points.r, 0 * points.r, points.z], axis=1))
+        np.testing.assert_allclose(north - bodies.position[i], tip * axis, atol=1e-12)
+        across = equator - bodies.position[i]
+        assert np.linalg.norm(across) == pytest.approx(bodies.radius[i], rel=1e-10)
+        assert abs(across @ axis) < 1e-12
