@@ -154,7 +154,7 @@ def _squirmer_pieces(quick: bool) -> Iterable[Piece]:
 
 
 def _field(edge: int) -> Path:
-    return CACHE / f"squirmers-{edge}.npz"
+    return CACHE / f"squirmers-{edge}.npy"
 
 
 def checked_out() -> str:
@@ -338,7 +338,8 @@ def main() -> None:
     if options.figure:
         pages.draw(known, records, options.figure)
     if options.picture:
-        pages.draw_flow(_field(2 if options.quick else 5), options.picture)
+        (task,) = {json.dumps(p.task): p.task for p in todo if p.part == "squirmers"}.values()
+        pages.draw_flow(task, options.picture)
 
 
 if __name__ == "__main__":

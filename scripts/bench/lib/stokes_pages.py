@@ -335,26 +335,14 @@ def _draw_rival(axis: Any, found: list[tuple[str, float, dict[str, Any]]]) -> No
              title=f"{bodies} random spheroids")  # fmt: skip
 
 
-def draw_flow(field: Path, path: Path) -> None:
+def draw_flow(task: dict[str, Any], path: Path) -> None:
     """Streamlines and speed in the plane through the middle of the active spheroids."""
-    import matplotlib
+    from lib.stokes_scenes import grid_of_spheroids
+    from lib.stokes_work import middle_plane
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from stokes.render import draw_slice
 
-    with np.load(field) as stored:
-        velocity, outside, box = stored["velocity"], stored["outside"], float(stored["box"])
-    speed = np.where(outside, np.linalg.norm(velocity, axis=2), np.nan)
-    side = np.linspace(0.0, box, speed.shape[0])
-    figure, axis = plt.subplots(figsize=(9.2, 8), constrained_layout=True)
-    shown = axis.imshow(speed, origin="lower", extent=(0.0, box, 0.0, box), cmap="viridis",
-                        interpolation="bilinear", vmin=0.0, vmax=10.0)  # fmt: skip
-    u, w = (np.where(outside, velocity[..., k], np.nan) for k in (0, 2))
-    axis.streamplot(side, side, u, w, density=3.5, color="white", linewidth=0.6, arrowsize=0.6)
-    axis.contourf(side, side, np.where(outside, 0.0, 1.0), levels=[0.5, 1.5], colors=["#c9c4bb"],
-                  zorder=3)  # fmt: skip
-    axis.set(xlim=(0.0, box), ylim=(0.0, box), xticks=[], yticks=[])
-    figure.colorbar(shown, label="speed", shrink=0.8)
+    scene = grid_of_spheroids(task["edge"], task["spacing"])
+    plane, velocity = middle_plane(scene, task["pixels"]), np.load(task["field"])
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    draw_slice(path, plane, velocity, scene.bodies(), f"{scene.count} active spheroids")

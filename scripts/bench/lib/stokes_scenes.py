@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stokes.exact import stokeslet_velocity
-from stokes.geometry import Body, spheroid
+from stokes.geometry import Body, close_pairs, gaps, gaps_of_pairs, spheroid
 
 SEED = 20210301
 FLATTEST = 0.35  # least ratio of semi-axes of a random spheroid
@@ -56,15 +56,7 @@ class Scene:
 
     def bodies(self) -> list[Body]:
         """The bodies as the package takes them."""
-        return [
-            Body(spheroid(*axes), 1.0, tuple(centre), tuple(quaternion))
-            for axes, centre, quaternion in zip(
-                self.semi_axes.tolist(),
-                self.centres.tolist(),
-                self.quaternions.tolist(),
-                strict=True,
-            )
-        ]
+        return _bodies_of(self.semi_axes, self.centres, self.quaternions)
 
     @property
     def rotations(self) -> NDArray:
@@ -148,23 +140,29 @@ def _add_all(
 def _gaps_to_last(
     axes: NDArray, centres: NDArray, quaternions: NDArray, chosen: NDArray
 ) -> NDArray:
-    from stokes.distance import gaps
-
-    rows = (axes[chosen], centres[chosen], quaternions[chosen])
-    bodies = Scene(*rows, box=0.0, gap=0.0).bodies()
-    return np.asarray(gaps([bodies[-1]] * (len(bodies) - 1), bodies[:-1]))
+    """Distances of the last of the chosen bodies from the others."""
+    bodies = _bodies_of(axes[chosen], centres[chosen], quaternions[chosen])
+    return gaps([bodies[-1]] * (len(bodies) - 1), bodies[:-1]).distance
 
 
 def least_gap(axes: NDArray, centres: NDArray, quaternions: NDArray) -> float:
-    """The least distance between surfaces, infinite for one body."""
-    reach, least = axes.max(axis=1), math.inf
-    for k in range(1, len(axes)):
-        distance = np.linalg.norm(centres[:k] - centres[k], axis=1)
-        near = np.flatnonzero(distance < reach[:k] + reach[k] + min(least, 2.0))
-        if len(near):
-            found = _gaps_to_last(axes, centres, quaternions, np.append(near, k))
-            least = min(least, float(found.min()))
-    return least
+    """The least distance between surfaces."""
+    bodies, reach = _bodies_of(axes, centres, quaternions), 0.2
+    while True:
+        pairs = close_pairs(bodies, reach)
+        found = gaps_of_pairs(bodies, pairs).distance if len(pairs) else np.empty(0)
+        if found.min(initial=math.inf) <= reach:
+            return float(found.min())
+        reach *= 2.0
+
+
+def _bodies_of(axes: NDArray, centres: NDArray, quaternions: NDArray) -> list[Body]:
+    return [
+        Body(spheroid(*shape), 1.0, tuple(centre), tuple(quaternion))
+        for shape, centre, quaternion in zip(
+            axes.tolist(), centres.tolist(), quaternions.tolist(), strict=True
+        )
+    ]
 
 
 def grid_of_spheroids(edge: int, spacing: float) -> Scene:

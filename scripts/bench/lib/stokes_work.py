@@ -14,7 +14,7 @@ surfaces: "point_forces" of a flow that is known exactly, or "rigid", a motion o
 from __future__ import annotations
 
 import resource
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
@@ -24,6 +24,7 @@ import numpy as np
 from lib import stokes_scenes as scenes
 from lib.stokes_scenes import PointForces, Scene
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from dem_mpi.parallel import Parallel
 
@@ -78,6 +79,7 @@ def _memory(parallel: Parallel) -> float:
 def _single(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
     """Seconds of each stage and the error outside, with the single layer."""
     from stokes.evaluate import evaluate
+    from stokes.fmm import FmmOptions
     from stokes.formulation import ShapeSolver
     from stokes.geometry import Resolution, SurfaceGrid
     from stokes.operators import ModalOperators
@@ -92,16 +94,18 @@ def _single(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
         with clock.of("kernels"):
             operators = ModalOperators(body.curve, resolution)
             operators.matrices("single")
-        with clock.of("factorisation"):
-            solver = ShapeSolver(operators, task["formulation"])
-            solver.factorise()
+        solver = ShapeSolver(operators, task["formulation"])
         grid: SurfaceGrid = solver.grid
         data = body.vectors_to_local(flow.velocity(body.to_world(grid.points.reshape(-1, 3))))
+        with clock.of("factorisation"):  # at the first solve, whose share is taken off below
+            solver.solve(data.reshape(grid.points.shape))
         with clock.of("solve"):
             density = solver.solve(data.reshape(grid.points.shape))
+        clock.seconds["factorisation"] -= clock.seconds["solve"]
         with clock.of("evaluation"):
             rho, mu = solver.layers(density, body.scale)
-            found = evaluate([body], [resolution], rho, mu, points, tolerance=1e-14)
+            found = evaluate([body], [resolution], points, _flat(rho), _flat(mu),
+                             tolerance=1e-13, options=FmmOptions(backend="direct"))  # fmt: skip
         return clock.seconds, found
 
     once(Resolution.uniform(2, NODES, 4))  # compiles, or loads what is compiled
@@ -117,6 +121,10 @@ def _single(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
         "error_by_component": float((error / np.abs(exact)).max()),
         "memory": _memory(parallel),
     }
+
+
+def _flat(density: NDArray | None) -> NDArray | None:
+    return None if density is None else density.reshape(-1, 3)
 
 
 # ---- a suspension --------------------------------------------------------------------------
@@ -161,10 +169,8 @@ def _measured(parallel: Parallel, scene: Scene, task: dict[str, Any]) -> dict[st
         if task["data"] == "point_forces":
             solution = suspension.solve(boundary_velocity=flow.velocity(suspension.nodes))
         else:
-            velocity, spin = motion_of(scene, task["data"])
-            solution = suspension.solve(
-                velocity=velocity[suspension.mine], angular_velocity=spin[suspension.mine]
-            )
+            (velocity, spin), mine = motion_of(scene, task["data"]), rows_of(scene, suspension)
+            solution = suspension.solve(velocity=velocity[mine], angular_velocity=spin[mine])
     found = described(parallel, scene, suspension, solution)
     loads = np.array(found["loads"])
     if task["data"] == "point_forces":
@@ -186,10 +192,16 @@ def motion_of(scene: Scene, data: str) -> tuple[NDArray, NDArray]:
     return (rest, along) if data.startswith("spin") else (along, rest)
 
 
+def rows_of(scene: Scene, suspension: Any) -> NDArray:
+    """Rows of this rank's bodies in the scene."""
+    row = {body: k for k, body in enumerate(scene.bodies())}
+    return np.array([row[body] for body in suspension.bodies], dtype=int)
+
+
 def described(parallel: Parallel, scene: Scene, suspension: Any, solution: Any) -> dict[str, Any]:
     """Collective. What is said of a solution whatever was asked."""
     loads = np.zeros((scene.count, 6))
-    loads[suspension.mine] = np.concatenate([solution.forces, solution.torques], axis=1)
+    loads[rows_of(scene, suspension)] = np.concatenate([solution.forces, solution.torques], axis=1)
     parallel.sum_in_place(loads)
     return {
         "bodies": scene.count,
@@ -265,21 +277,21 @@ def _multiblob(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
 # ---- active spheroids ----------------------------------------------------------------------
 
 
-def pole_to_pole(bodies: Sequence[Any], nodes: Sequence[NDArray], speed: float) -> list[NDArray]:
-    """Slip (k, 3) at nodes (k, 3) of each spheroid, along meridians from pole to pole.
+def pole_to_pole(scene: Scene, points: NDArray, speed: float) -> NDArray:
+    """Slip (n, 3) at points (n, 3) of the surfaces of a grid, along meridians to the north pole.
 
     speed r / equatorial: `speed` at the equator, zero at the poles.
     """
-    slips = []
-    for body, points in zip(bodies, nodes, strict=True):
-        a, c = body.curve.equatorial, body.curve.polar
-        x, y, z = body.to_local(points).T
-        r2 = x**2 + y**2
-        # r times the meridian's tangent (-z r_hat / c^2 + r z_hat / a^2, normalised)
-        tangent = np.stack([-z * x / c**2, -z * y / c**2, r2 / a**2], axis=1)
-        length = np.sqrt(r2 / a**4 + z**2 / c**4)
-        slips.append(body.vectors_to_world(speed / a * tangent / length[:, None]))
-    return slips
+    body = cKDTree(scene.centres).query(points)[1]
+    R = scene.rotations[body]
+    equatorial, polar = scene.semi_axes[body].T
+    x, y, z = np.einsum("nij,ni->jn", R, points - scene.centres[body])
+    r2, slope = x**2 + y**2, -z / polar**2
+    # r times the meridian's tangent, (-z/c^2 along r, r/a^2 along z) over its length.
+    tangent = np.stack([slope * x, slope * y, r2 / equatorial**2], axis=1)
+    length = np.sqrt(r2 / equatorial**4 + slope**2)
+    local = (speed / (equatorial * length))[:, None] * tangent
+    return np.einsum("nij,nj->ni", R, local)
 
 
 def _squirmers(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
@@ -289,30 +301,23 @@ def _squirmers(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
     clock = Clock(parallel)
     with clock.of("set-up"):
         suspension = suspension_of(parallel, scene, task)
-    bodies = suspension.bodies
-    nodes = np.split(suspension.nodes, np.cumsum(suspension.nodes_by_body)[:-1])
-    slip = np.concatenate(pole_to_pole(bodies, nodes, task["speed"]))
+    slip = pole_to_pole(scene, suspension.nodes, task["speed"])
     with clock.of("held"):
         held = suspension.solve(boundary_velocity=slip)
     found = described(parallel, scene, suspension, held)
-    rest = np.zeros((len(bodies), 3))
+    rest = np.zeros((len(suspension.bodies), 3))
     with clock.of("free"):
         free = suspension.solve(force=rest, torque=rest, slip=slip)
-    points, shape = _plane(scene, task["pixels"])
+    plane = middle_plane(scene, task["pixels"])
+    points = plane.points()
     share = slice(parallel.rank, None, parallel.size)
     with clock.of("evaluation"):
         mine = held.velocity(points[share])
     velocity = np.zeros((len(points), 3))
-    velocity[share] = np.nan_to_num(mine)
+    velocity[share] = mine  # NaN inside bodies, also of the sum over the ranks
     parallel.sum_in_place(velocity)
     if parallel.rank == 0 and task.get("field"):
-        outside = ~scene.inside(points, 0.0)
-        np.savez(
-            task["field"],
-            velocity=velocity.reshape(*shape, 3),
-            outside=outside.reshape(shape),
-            box=scene.box,
-        )
+        np.save(task["field"], velocity)
     return found | {
         "iterations_free": free.iterations,
         "fastest": parallel.max(float(np.linalg.norm(free.velocities, axis=1).max())),
@@ -322,9 +327,9 @@ def _squirmers(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _plane(scene: Scene, pixels: int) -> tuple[NDArray, tuple[int, int]]:
-    """Points (k, 3) of a plane through the middle layer of the grid, x fastest."""
-    side = np.linspace(0.0, scene.box, pixels)
-    z, x = np.meshgrid(side, side, indexing="ij")
-    y = np.full(x.size, 0.5 * scene.box)
-    return np.stack([x.ravel(), y, z.ravel()], axis=1), (pixels, pixels)
+def middle_plane(scene: Scene, pixels: int) -> Any:
+    """The plane through the middle layer of the grid, across y."""
+    from stokes.render import Plane
+
+    middle, low, high = 0.5 * scene.box, (0.0, 0.0), (scene.box, scene.box)
+    return Plane(1, middle, low, high, (pixels, pixels))
