@@ -30,7 +30,8 @@ from scipy.spatial import cKDTree
 
 from stokes import _kernels_near as kernels
 from stokes._layer_kernels import LAYER_KERNELS
-from stokes.curves import Curve
+from stokes.curves import Curve, CurvePoints
+from stokes.distance import distance
 from stokes.fmm._threads import limited_threads
 from stokes.fmm.kernels import Kernel
 from stokes.fmm.near_field import NearField as PairSums
@@ -48,10 +49,13 @@ _FACTORS = (1, 2, 3, 4, 6, 8)
 # Above it a block of modes is cheaper than the refined panel, after some ten applications.
 _MOST_REFINED = 16
 _EXACT = Refinement(0, 0)
-# Of the error in a unit of e^{-N xi}: found over random targets, densities and shapes.
-_LOG_CONSTANT = math.log(10.0)
+# C of the errors C distance^(1 - order) e^{-N xi} of single and double layers: no less was found
+# over random targets, densities and shapes.
+_CONSTANTS = {"velocity": (0.5, 25.0), "pressure": (1.0, 50.0), "stress": (20.0, 400.0)}
 # Numbers of kernel values held at once while blocks are made.
 _CHUNK_VALUES = 4_000_000
+# From this tolerance on blocks are kept in single precision, unless the kernel is hypersingular.
+_SINGLE = 1e-6
 # Derivatives of 1/r in each quantity's kernel: single layer, double layer.
 _ORDER = {"velocity": (0, 1), "pressure": (1, 2), "stress": (1, 2)}
 # Rows of a block that are odd in the azimuth.
@@ -60,7 +64,7 @@ _ODD = {
     "pressure": (False,),
     "stress": (False, True, False, False, True, False),
 }
-# On the surface, hypersingular kernels are extrapolated from so many distances so far apart
+# On the surface, kernels stronger than 1/r are extrapolated from so many distances so far apart
 # (lengths of the panel): cancellation loses eps/distance, extrapolation errs by its fifth power.
 _EXTRAPOLATED, _STEP = 5, 1e-3
 
@@ -128,7 +132,9 @@ def reach(shape: UnitShape, layers: Layers, tolerance: float) -> float:
 
 def _digits(layers: Layers, tolerance: float) -> tuple[float, float]:
     """(log(C/tolerance), power of the distance) of the errors of plain rules."""
-    return _LOG_CONSTANT - math.log(tolerance), 1.0 - layers.order
+    single, double = _CONSTANTS[layers.quantity]
+    constant = single if layers.double is None else double
+    return math.log(constant / tolerance), 1.0 - layers.order
 
 
 @dataclass
@@ -374,8 +380,7 @@ class _Blocks:
         for h in np.unique(self.shape).tolist():
             members = np.flatnonzero(self.shape == h)
             self._fill(self.surfaces.shapes[h], members, close)
-        single = near.tolerance >= 1e-6
-        if single:
+        if near.tolerance >= _SINGLE and near.layers.order < 2:
             self.block = self.block.astype(np.float32)
 
     @property
@@ -421,18 +426,17 @@ class _Blocks:
 
     def _distances(self, shape: UnitShape, foot: Foot, members: Index) -> tuple[Array, Array]:
         """Distances at which each entry is evaluated, and their weights: (e, k) twice."""
-        distance = foot.distance[:, None]
-        if self.layers.order < 2:
+        gap = foot.distance[:, None]
+        if self.layers.order == 0:
             # the limit from outside, to the error that the tolerance leaves
             least = 1e-3 * self.tolerance
-            return np.where(np.abs(distance) < least, least, distance), np.ones_like(distance)
+            return np.where(np.abs(gap) < least, least, gap), np.ones_like(gap)
         edges = np.diff(shape.resolution.breaks)
         step = (_STEP * edges[self.panel[members]] * foot.speed)[:, None]
         k = np.arange(_EXTRAPOLATED + 1)
         binomial = np.array([math.comb(_EXTRAPOLATED, i) for i in k])
         weights = np.where(k > 0, (-1.0) ** (k + 1) * binomial, 0.0)
-        close = distance < step
-        return distance + k * step, np.where(close, weights, k == 0)
+        return gap + k * step, np.where(gap < step, weights, k == 0)
 
     def add(self, density: Array, out: Array) -> None:
         """Add to out (t, rows, m)."""
@@ -498,23 +502,10 @@ class Foot:
 
     @classmethod
     def of(cls, shape: UnitShape, r: Array, z: Array) -> Foot:
-        """By Newton's method for (gamma - x).gamma' = 0 from the nearest node or pole."""
-        m = shape.meridian
-        ends = shape.curve.evaluate(np.array([0.0, 1.0]))
-        tree = cKDTree(
-            np.column_stack([np.append(m.r, ends.r), np.append(m.z, ends.z)]),
-        )
-        s = np.append(m.s, [0.0, 1.0])[tree.query(np.column_stack([r, z]))[1]]
-        for _ in range(8):
-            p = shape.curve.evaluate(s)
-            dr, dz = p.r - r, p.z - z
-            slope = p.dr**2 + p.dz**2
-            bend = slope + dr * p.d2r + dz * p.d2z
-            step = (dr * p.dr + dz * p.dz) / np.maximum(bend, 0.3 * slope)
-            s = np.clip(s - step, 0.0, 1.0)
+        """Of targets in the meridian plane, (k,) each."""
+        _, s = distance(shape.curve, r, z)
         p = shape.curve.evaluate(s)
-        distance = p.normal_r * (r - p.r) + p.normal_z * (z - p.z)
-        return cls(s, distance, p.speed)
+        return cls(s, p.normal_r * (r - p.r) + p.normal_z * (z - p.z), p.speed)
 
 
 @dataclass(frozen=True)
@@ -537,9 +528,9 @@ class _Samples:
     def of(
         cls, shape: UnitShape, foot: Foot, panel: Index, distances: tuple[Array, Array]
     ) -> _Samples:
-        distance, weight = distances
+        gap, weight = distances
         entry, column = np.nonzero(weight)
-        d, s = distance[entry, column], foot.s[entry]
+        d, s = gap[entry, column], foot.s[entry]
         p = shape.curve.evaluate(s)
         target = np.column_stack(
             [np.maximum(p.r + d * p.normal_r, 0.0), p.z + d * p.normal_z, p.normal_r, p.normal_z]
@@ -551,7 +542,7 @@ class _Samples:
 
 
 def _graded_towards(
-    shape: UnitShape, target: Array, panel: Index, s: Array, d: Array, foot
+    shape: UnitShape, target: Array, panel: Index, s: Array, d: Array, foot: CurvePoints
 ) -> NDArray[np.complex128]:
     """Where the continued curve meets each target: from its foot, or from the panel's nodes.
 
@@ -594,7 +585,7 @@ class _GradedRule:
         pieces = np.empty((total, 2))
         kernels.graded_pieces(samples.s0, begin, end, count, pieces)
         # half of the panel's degree: on pieces shorter than the panel the density is smoother
-        digits = _LOG_CONSTANT - math.log(tolerance)
+        digits = math.log(10.0 / tolerance)
         x, w = gauss_legendre(math.ceil(0.5 * digits / math.log(kernels.ELLIPSE)) + q // 2)
         length = np.diff(pieces, axis=1)
         s = (pieces[:, :1] + length * x).ravel()

@@ -154,7 +154,7 @@ class Surfaces:
         array = np.asarray(values, dtype=np.float64)
         if array.ndim not in (2, 3) or array.shape[:2] != (self.nodes, 3):
             raise ValueError(f"density of shape {array.shape}: must be ({self.nodes}, 3[, m])")
-        return np.ascontiguousarray(array.reshape(self.nodes, 3, -1))
+        return np.ascontiguousarray(array if array.ndim == 3 else array[:, :, None])
 
 
 class PanelSources:
