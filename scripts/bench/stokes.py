@@ -218,11 +218,15 @@ def _single_records(known: Known) -> Iterable[Record]:
     together = [(p, r) for p, r in found if p.task["modes"] == 5 * p.task["panels"]]
     if not together:
         return
-    piece, best = min(together, key=lambda one: one[1]["error_by_component"])
+    piece, best = min(together, key=lambda one: one[1]["error_to_largest"])
+    params = {k: piece.task[k] for k in ("panels", "modes")}
+    error = best["error_to_largest"]
+    yield Record("stokes.single_body_error", params | {"over": "largest velocity"}, error, "1",
+                 error=error)  # fmt: skip
     error = best["error_by_component"]
-    params = {k: piece.task[k] for k in ("panels", "modes")} | {"measure": "(3.141)"}
-    yield Record("stokes.single_body_error", params, error, "1", rival="S. De 2021, figure 3.2",
-                 rival_value=1e-9, ratio=error / 1e-9, error=error)  # fmt: skip
+    yield Record("stokes.single_body_error_by_component", params | {"over": "each component"},
+                 error, "1", rival="S. De 2021, figure 3.2", rival_value=1e-9, ratio=error / 1e-9,
+                 error=error)  # fmt: skip
     for stage in best["seconds"]:
         points = [(r["nodes"], r["seconds"][stage]) for _, r in together]
         if len(points) > 2:

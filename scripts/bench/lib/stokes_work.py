@@ -16,6 +16,7 @@ from __future__ import annotations
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -167,7 +168,7 @@ def _measured(parallel: Parallel, scene: Scene, task: dict[str, Any]) -> dict[st
         suspension = suspension_of(parallel, scene, task)
     with clock.of("solve"):
         if task["data"] == "point_forces":
-            solution = suspension.solve(boundary_velocity=flow.velocity(suspension.nodes))
+            solution = suspension.solve(boundary_velocity=flow.velocity)
         else:
             (velocity, spin), mine = motion_of(scene, task["data"]), rows_of(scene, suspension)
             solution = suspension.solve(velocity=velocity[mine], angular_velocity=spin[mine])
@@ -277,7 +278,7 @@ def _multiblob(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
 # ---- active spheroids ----------------------------------------------------------------------
 
 
-def pole_to_pole(scene: Scene, points: NDArray, speed: float) -> NDArray:
+def pole_to_pole(scene: Scene, speed: float, points: NDArray) -> NDArray:
     """Slip (n, 3) at points (n, 3) of the surfaces of a grid, along meridians to the north pole.
 
     speed r / equatorial: `speed` at the equator, zero at the poles.
@@ -301,7 +302,7 @@ def _squirmers(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
     clock = Clock(parallel)
     with clock.of("set-up"):
         suspension = suspension_of(parallel, scene, task)
-    slip = pole_to_pole(scene, suspension.nodes, task["speed"])
+    slip = partial(pole_to_pole, scene, task["speed"])
     with clock.of("held"):
         held = suspension.solve(boundary_velocity=slip)
     found = described(parallel, scene, suspension, held)
