@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from stokes.body import ShapeSolver
+from stokes.formulation import ShapeSolver
 from stokes.suspension_layout import Field, Layout
 
 

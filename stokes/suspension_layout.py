@@ -107,6 +107,13 @@ class Layout:
         """Row of the body that each node belongs to (n,)."""
         return np.repeat(np.arange(self.bodies), np.diff(self.offsets))
 
-    def nodes_of(self, row: int) -> slice:
-        """Nodes of the body in this row."""
-        return slice(int(self.offsets[row]), int(self.offsets[row + 1]))
+    @property
+    def rows(self) -> NDArray:
+        """Row (b,) of each body as given: the inverse of `order`."""
+        rows = np.empty_like(self.order)
+        rows[self.order] = np.arange(self.bodies)
+        return rows
+
+    def range_of(self, row: int) -> NDArray:
+        """Nodes of the body in this row, one after another."""
+        return np.arange(self.offsets[row], self.offsets[row + 1])
