@@ -156,7 +156,7 @@ def _de_table(known: Known, aim: str) -> str:
             f"{row['bodies']}", str(piece.ranks), f"{row['nodes']:,}", _number(row["gap"]),
             _number(row["volume_fraction"]), _told(row["iterations"], piece, row, "applications"),
             *map(_number, seconds), _told(whole, piece, row, "seconds"),
-            _number(row["error_absolute"].get("box")),
+            _told(row["error_absolute"].get("box", math.nan), piece, row, "error"),
             _number(max(row["error_to_largest"].values())),
         ])  # fmt: skip
     heads = ["bodies", "ranks", "nodes", "least gap", "volume fraction", "applications",
@@ -171,11 +171,13 @@ def _sum(phases: dict[str, float], names: Sequence[str]) -> float:
 
 def _told(value: float, piece: Any, row: dict[str, Any], field: str) -> str:
     """Ours, and S. De's behind it at his resolution."""
-    ours = _number(value, 3) + ("" if row["converged"] else " (not converged)")
+    digits = 2 if field == "error" else 3
+    unfinished = field == "applications" and not row["converged"]
+    ours = _number(value, digits) + (" (not converged)" if unfinished else "")
     if piece.task.get("resolution") is None:
         return ours
     his = DE_TABLE.get((piece.ranks, row["bodies"]))
-    return f"{ours} / {_number(getattr(his, field, None), 3)}"
+    return f"{ours} / {_number(getattr(his, field, None), digits)}"
 
 
 def _gap_table(known: Known) -> str:
