@@ -3,7 +3,8 @@
 `/VTKHDF` is a collection of two or three blocks in VTK's own format (ParaView 5.13 or newer):
 
     bodies      a point a body: force [N], torque and stresslet [N m], velocity, ...
-    surfaces    the nodes on the surfaces, joined to polygons: density [Pa], weight [m^2], normal
+    surfaces    the nodes on the surfaces, joined to polygons: density [Pa], weight [m^2], normal;
+                double_density [m/s] where there is a double layer
     field       velocity [m/s] and pressure [Pa] on a regular grid, or at points
 
 Beside it the same data stand under plain names (hard links): `f["bodies/force"]`,
@@ -58,7 +59,13 @@ BODY_COLUMNS: Mapping[str, tuple[tuple[int, ...], str]] = {
     "stresslet": ((3, 3), "N m"),
 }
 _INTEGERS = ("gid", "shape")
-_SURFACE_UNITS = {"position": "m", "normal": "1", "weight": "m^2", "density": "Pa", "gid": "1"}
+_SURFACE_UNITS = {
+    "position": "m",
+    "normal": "1",
+    "weight": "m^2",
+    "density": "Pa",
+    "double_density": "m/s",
+}
 _FIELD_UNITS = {"position": "m", "velocity": "m/s", "pressure": "Pa"}
 
 
@@ -66,8 +73,9 @@ _FIELD_UNITS = {"position": "m", "velocity": "m/s", "pressure": "Pa"}
 class Surfaces:
     """Nodes of bodies, one body's behind the other's.
 
-    grid : (b, 2) rings n_s and azimuths n_theta of each; position, normal, density : (n, 3);
-    weight : (n,) of surface integrals
+    grid : (b, 2) rings n_s and azimuths n_theta of each; position, normal : (n, 3);
+    weight : (n,) of surface integrals; density, double_density : (n, 3) rho and mu of the layers
+    that make the disturbance, u = S rho / viscosity + D mu, None without a double layer
     """
 
     grid: NDArray
@@ -75,6 +83,13 @@ class Surfaces:
     normal: NDArray
     weight: NDArray
     density: NDArray
+    double_density: NDArray | None = None
+
+    @property
+    def columns(self) -> dict[str, NDArray]:
+        """What there is of every node, by name."""
+        columns = {name: getattr(self, name) for name in _SURFACE_UNITS}
+        return {name: values for name, values in columns.items() if values is not None}
 
     @property
     def offset(self) -> NDArray:
@@ -177,8 +192,8 @@ def write_flow(parallel: Parallel, path: Path | str, flow: Flow, rows: NDArray) 
 def _gathered_flow(parallel: Parallel, flow: Flow) -> Flow | None:
     """Collective. The flow of all ranks, bodies and points in rank order, on rank 0."""
     bodies = {name: _gathered(parallel, flow.bodies[name]) for name in sorted(flow.bodies)}
-    parts = ("grid", "position", "normal", "weight", "density")
-    surfaces = {name: _gathered(parallel, getattr(flow.surfaces, name)) for name in parts}
+    parts = {"grid": flow.surfaces.grid, **flow.surfaces.columns}
+    surfaces = {name: _gathered(parallel, values) for name, values in parts.items()}
     values = None
     if flow.field is not None:
         names = ("velocity", "pressure", *(["position"] if flow.field.grid is None else []))
@@ -196,10 +211,8 @@ def _sorted(flow: Flow, place: NDArray) -> Flow:
     # A body's nodes move together: from where they start to where those before them end.
     shift = start - (np.cumsum(size) - size)
     nodes = np.arange(given.offset[-1]) + np.repeat(shift, size)
-    surfaces = Surfaces(
-        given.grid[place],
-        *(v[nodes] for v in (given.position, given.normal, given.weight, given.density)),
-    )
+    columns = {name: values[nodes] for name, values in given.columns.items()}
+    surfaces = Surfaces(given.grid[place], **columns)
     bodies = {name: column[place] for name, column in flow.bodies.items()}
     return Flow(bodies, surfaces, flow.attributes, flow.field)
 
@@ -264,12 +277,13 @@ def _write_surfaces(
     block = _block(root, "surfaces", b"PolyData", 1)
     connectivity, offsets = _polygons(surfaces.grid, surfaces.offset[:-1])
     _write_points(block, surfaces.position, connectivity, offsets, "Polygons")
-    for name in ("normal", "weight", "density"):
-        _dataset(block, f"PointData/{name}", getattr(surfaces, name))
+    columns = surfaces.columns
+    for name, values in columns.items():
+        if name != "position":
+            _dataset(block, f"PointData/{name}", values)
     if gid is not None:
         _dataset(block, "PointData/gid", np.repeat(gid, np.diff(surfaces.offset)))
-    units = {n: u for n, u in _SURFACE_UNITS.items() if n != "gid" or gid is not None}
-    group = _link(file, "surfaces", block, units)
+    group = _link(file, "surfaces", block, {name: _SURFACE_UNITS[name] for name in columns})
     _dataset(group, "grid", surfaces.grid.astype(np.int64))
     _dataset(group, "offset", surfaces.offset)
 
@@ -398,8 +412,8 @@ def _read(file: h5py.File) -> Flow:
     count = len(bodies["position"])
     bodies = {n: v.reshape(count, *BODY_COLUMNS[n][0]) for n, v in bodies.items()}
     group = _member(file, "surfaces", h5py.Group)
-    names = ("grid", "position", "normal", "weight", "density")
-    surfaces = Surfaces(**{name: _values(group, name) for name in names})
+    names = [name for name in _SURFACE_UNITS if name != "double_density" or name in group]
+    surfaces = Surfaces(**{name: _values(group, name) for name in ("grid", *names)})
     agree = np.array_equal(_values(group, "offset"), surfaces.offset)
     if not agree or len(surfaces.grid) != count or len(surfaces.position) != surfaces.offset[-1]:
         raise ValueError("'surfaces' contradicts itself or 'bodies'")
