@@ -301,7 +301,7 @@ def _draw_gaps(axis: Any, found: Known) -> None:
         label = name if kind == "neighbours" else None
         axis.loglog(*zip(*sorted(line), strict=True), style, color=colours[name], label=label)
     axis.set(xlabel="gap / radius", ylabel="iterations to 1e-6",
-             title="with neighbours' inverses (dashed: one-body inverses)")  # fmt: skip
+             title="dashed: one-body inverses alone")  # fmt: skip
 
 
 def _draw_table(axis: Any, found: Known, field: str) -> None:

@@ -49,10 +49,10 @@ class Scene:
         return len(self.centres)
 
     @property
-    def volume_fraction(self) -> float:
-        """Volume of the bodies over that of the box."""
+    def volume_fraction(self) -> float | None:
+        """Volume of the bodies over that of the box, None without one."""
         volumes = 4.0 / 3.0 * math.pi * self.semi_axes[:, 0] ** 2 * self.semi_axes[:, 1]
-        return float(volumes.sum() / self.box**3) if self.box else math.nan
+        return float(volumes.sum() / self.box**3) if self.box else None
 
     def bodies(self) -> list[Body]:
         """The bodies as the package takes them."""

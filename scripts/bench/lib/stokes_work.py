@@ -25,7 +25,6 @@ import numpy as np
 from lib import stokes_scenes as scenes
 from lib.stokes_scenes import PointForces, Scene
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from dem_mpi.parallel import Parallel
 
@@ -204,15 +203,17 @@ def described(parallel: Parallel, scene: Scene, suspension: Any, solution: Any) 
     loads = np.zeros((scene.count, 6))
     loads[rows_of(scene, suspension)] = np.concatenate([solution.forces, solution.torques], axis=1)
     parallel.sum_in_place(loads)
+    phases = {k: parallel.max(float(v)) for k, v in sorted(solution.report.seconds.items())}
     return {
         "bodies": scene.count,
-        "nodes": parallel.sum(len(suspension.nodes)),
+        "nodes": suspension.report.nodes,
+        "applications": solution.report.applications,
         "gap": scene.gap,
         "volume_fraction": scene.volume_fraction,
         "iterations": solution.iterations,
         "converged": bool(solution.converged),
         "residual": float(solution.residuals[-1]),
-        "phases": {k: parallel.max(float(v)) for k, v in dict(solution.seconds).items()},
+        "phases": phases,
         "loads": loads.tolist(),
     }
 
@@ -278,21 +279,17 @@ def _multiblob(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
 # ---- active spheroids ----------------------------------------------------------------------
 
 
-def pole_to_pole(scene: Scene, speed: float, points: NDArray) -> NDArray:
-    """Slip (n, 3) at points (n, 3) of the surfaces of a grid, along meridians to the north pole.
+def pole_to_pole(equatorial: float, polar: float, speed: float, points: NDArray) -> NDArray:
+    """Slip (k, 3) at points (k, 3) of a spheroid in its frame, along meridians to the north pole.
 
     speed r / equatorial: `speed` at the equator, zero at the poles.
     """
-    body = cKDTree(scene.centres).query(points)[1]
-    R = scene.rotations[body]
-    equatorial, polar = scene.semi_axes[body].T
-    x, y, z = np.einsum("nij,ni->jn", R, points - scene.centres[body])
+    x, y, z = points.T
     r2, slope = x**2 + y**2, -z / polar**2
     # r times the meridian's tangent, (-z/c^2 along r, r/a^2 along z) over its length.
     tangent = np.stack([slope * x, slope * y, r2 / equatorial**2], axis=1)
     length = np.sqrt(r2 / equatorial**4 + slope**2)
-    local = (speed / (equatorial * length))[:, None] * tangent
-    return np.einsum("nij,nj->ni", R, local)
+    return (speed / (equatorial * length))[:, None] * tangent
 
 
 def _squirmers(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
@@ -302,13 +299,13 @@ def _squirmers(parallel: Parallel, task: dict[str, Any]) -> dict[str, Any]:
     clock = Clock(parallel)
     with clock.of("set-up"):
         suspension = suspension_of(parallel, scene, task)
-    slip = partial(pole_to_pole, scene, task["speed"])
+    slip = [partial(pole_to_pole, body.curve.equatorial, body.curve.polar, task["speed"])
+            for body in suspension.bodies]  # fmt: skip
     with clock.of("held"):
-        held = suspension.solve(boundary_velocity=slip)
+        held = suspension.solve(velocity=(0.0, 0.0, 0.0), slip=slip)
     found = described(parallel, scene, suspension, held)
-    rest = np.zeros((len(suspension.bodies), 3))
     with clock.of("free"):
-        free = suspension.solve(force=rest, torque=rest, slip=slip)
+        free = suspension.solve(slip=slip)
     plane = middle_plane(scene, task["pixels"])
     points = plane.points()
     share = slice(parallel.rank, None, parallel.size)
