@@ -16,18 +16,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from dem_mpi.parallel import Parallel
-from stokes._layer_kernels import LAYER_KERNELS
 from stokes.distance import distance
 from stokes.fmm import Fmm, FmmOptions
 from stokes.geometry import Body, Resolution
-from stokes.near import Layers, NearField, Quantity, reach
+from stokes.layers import LAYER_KERNELS, Layers, Quantity
+from stokes.near import NearField, reach
 from stokes.sources import Refinement, Surfaces, UnitShape
 from stokes.suspension_table import BodyTable
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_ROWS = {"velocity": 3, "pressure": 1, "stress": 6}
 # Points of which blocks of the near field are held at once.
 _CHUNK = 20_000
 # Points this much inside a unit shape, and round-off of world coordinates, still count as on it.
@@ -169,7 +168,7 @@ class _Flow:
         self, points: Array, eps: float, options: FmmOptions, parallel: Parallel
     ) -> Array:
         """Collective. Sums over the plain rules of all bodies."""
-        values = np.zeros((len(points), _ROWS[self.layers.quantity]))
+        values = np.zeros((len(points), self.layers.rows))
         sources = self.own.sources()
         kernels = LAYER_KERNELS[self.layers.quantity]
         maps = (sources.single_weights, sources.double_weights)
@@ -295,7 +294,7 @@ class _CloseBodies:
     def corrections(self, points: Array, tolerance: float, threads: int) -> Array:
         """What the plain rules of these bodies miss, (m, rows)."""
         quantity = self.layers.quantity
-        values = np.zeros((len(points), _ROWS[quantity]))
+        values = np.zeros((len(points), self.layers.rows))
         single, double = self.densities
         parts = []
         if single is not None:

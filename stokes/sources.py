@@ -93,14 +93,16 @@ def _turned(radial: Array, axial: Array, theta: Array) -> Array:
     return np.stack([x, y, np.broadcast_to(axial[:, None], x.shape)], axis=-1)
 
 
-def refine(values: Array, resolution: Resolution, by: Refinement) -> Array:
-    """Panels' fields (g, nodes, n_theta, 3, m), local components, on refined nodes (g, k, 3, m)."""
+def refine(values: Array, by: Refinement, upward: Array) -> Array:
+    """Panels' fields (g, nodes, n_theta, 3, m), local components, on refined nodes (g, k, 3, m).
+
+    upward: (by.meridian nodes, nodes) interpolation along the meridian.
+    """
     g, q, angles, _, m = values.shape
     if by == (1, 1):
         return values.reshape(g, q * angles, 3, m)
     coefficients = to_modes(values.reshape(g * q, angles, 3, m))
     modes, rows, _ = coefficients.shape
-    upward = interpolation_matrix(q, gauss_legendre(by.meridian * q)[0])
     finer = coefficients.reshape(modes, rows, 3 * g, q) @ upward.T
     fine = from_modes(finer.reshape(modes, rows, -1), by.azimuth * angles, (m,))
     return fine.reshape(g, -1, 3, m)
@@ -157,6 +159,23 @@ class Surfaces:
         return np.ascontiguousarray(array if array.ndim == 3 else array[:, :, None])
 
 
+@dataclass(frozen=True)
+class _Group:
+    """Panels of one shape that are refined alike: their positions among the sources' panels."""
+
+    shape: UnitShape
+    by: Refinement
+    members: NDArray[np.int64]
+    nodes: PanelNodes
+    upward: Array
+
+    @classmethod
+    def of(cls, shape: UnitShape, by: Refinement, members: NDArray[np.int64]) -> _Group:
+        q = shape.resolution.nodes
+        upward = interpolation_matrix(q, gauss_legendre(by.meridian * q)[0])
+        return cls(shape, by, members, shape.refined(by), upward)
+
+
 class PanelSources:
     """Nodes of some panels of some bodies, each refined in its own way, as sources.
 
@@ -174,19 +193,19 @@ class PanelSources:
         self.surfaces = surfaces
         self.body, self.panel = body, panel
         by = np.ones((len(body), 2), np.int64) if refinement is None else np.array(refinement)
-        self._groups: list[tuple[UnitShape, Refinement, NDArray[np.int64], PanelNodes]] = []
+        self._groups: list[_Group] = []
         size = np.zeros(len(body), np.int64)
         for members in _alike(surfaces.shape[body], *by.reshape(-1, 2).T):
             shape = surfaces.shapes[surfaces.shape[body[members[0]]]]
             how = Refinement(*by[members[0]].tolist())
-            nodes = shape.refined(how)
-            size[members] = nodes.weights.shape[1]
-            self._groups.append((shape, how, members, nodes))
+            group = _Group.of(shape, how, members)
+            size[members] = group.nodes.weights.shape[1]
+            self._groups.append(group)
         self.end = np.cumsum(size)
         self.begin = self.end - size
         self.points = np.empty((int(size.sum()), 3))
-        for _, _, members, nodes in self._groups:
-            self.points[self._rows(members)] = self._in_world(nodes.points, members)
+        for group in self._groups:
+            self.points[self._rows(group.members)] = self._in_world(group)
 
     def single_weights(self, density: Array, coefficient: ArrayLike = 1.0) -> Array:
         """Weights (n, 3, m) of the kernel `stokeslet` for a (S f) of densities (N, 3, m).
@@ -206,38 +225,37 @@ class PanelSources:
         factor = np.broadcast_to(coefficient, s.bodies) * s.scale**layers / (8.0 * math.pi)
         fields = density.shape[2]
         weights = np.empty((len(self.points), 3 * layers, fields))
-        for shape, how, members, nodes in self._groups:
-            body = self.body[members]
-            fine = refine(self._gathered(density, shape, members), shape.resolution, how)
-            fine *= (nodes.weights[self.panel[members]] * factor[body, None])[..., None, None]
-            world = np.einsum("gij,gkjm->gkim", s.rotation[body], fine, optimize=True)
+        for group in self._groups:
+            body, panel = self.body[group.members], self.panel[group.members]
+            fine = refine(self._gathered(density, group), group.by, group.upward)
+            fine = fine * (group.nodes.weights[panel] * factor[body, None])[..., None, None]
+            world = np.matmul(s.rotation[body][:, None], fine)
             if layers == 2:
-                world = _stresslets(world, self._normals(nodes, members))
-            weights[self._rows(members)] = world.reshape(-1, 3 * layers, fields)
+                world = _stresslets(world, _turn(group.nodes.normals[panel], s.rotation[body]))
+            weights[self._rows(group.members)] = world.reshape(-1, 3 * layers, fields)
         return weights
 
-    def _gathered(self, density: Array, shape: UnitShape, members: NDArray[np.int64]) -> Array:
+    def _gathered(self, density: Array, group: _Group) -> Array:
         """Nodal densities of panels (g, nodes, n_theta, 3, m)."""
-        first = self.surfaces.start[self.body[members]] + self.panel[members] * shape.panel_nodes
-        rows = first[:, None] + np.arange(shape.panel_nodes)
-        resolution = shape.resolution
-        return density[rows].reshape(
-            len(members), resolution.nodes, resolution.angles, 3, density.shape[2]
-        )
+        size, resolution = group.shape.panel_nodes, group.shape.resolution
+        first = self.surfaces.start[self.body[group.members]] + self.panel[group.members] * size
+        nodal = density[first[:, None] + np.arange(size)]
+        return nodal.reshape(-1, resolution.nodes, resolution.angles, 3, density.shape[2])
 
-    def _in_world(self, points: Array, members: NDArray[np.int64]) -> Array:
-        s, body = self.surfaces, self.body[members]
-        turned = np.einsum("gij,gkj->gki", s.rotation[body], points[self.panel[members]])
+    def _in_world(self, group: _Group) -> Array:
+        s, body = self.surfaces, self.body[group.members]
+        turned = _turn(group.nodes.points[self.panel[group.members]], s.rotation[body])
         moved = s.centre[body][:, None] + s.scale[body][:, None, None] * turned
         return moved.reshape(-1, 3)
-
-    def _normals(self, nodes: PanelNodes, members: NDArray[np.int64]) -> Array:
-        rotation = self.surfaces.rotation[self.body[members]]
-        return np.einsum("gij,gkj->gki", rotation, nodes.normals[self.panel[members]])
 
     def _rows(self, members: NDArray[np.int64]) -> NDArray[np.int64]:
         size = self.end[members[0]] - self.begin[members[0]]
         return (self.begin[members][:, None] + np.arange(size)).ravel()
+
+
+def _turn(vectors: Array, rotation: Array) -> Array:
+    """Vectors (g, k, 3) turned by rotations (g, 3, 3)."""
+    return vectors @ np.swapaxes(rotation, 1, 2)
 
 
 def _alike(*keys: NDArray[np.int64]) -> list[NDArray[np.int64]]:

@@ -1,4 +1,4 @@
-"""The sums by which layers' velocity, pressure and stress are evaluated, and their one new kernel.
+"""Layer potentials: which, of which densities, and the sums that give velocity, pressure, stress.
 
 The stress of a double layer, rows in the order 00, 11, 22, 12, 02, 01, with W the symmetric
 matrix of the weights of `stresslet` (off the diagonal: density times normal in both orders):
@@ -8,7 +8,11 @@ W_ii twice the weight; its trace is -3 times the pressure.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 from numba.extending import register_jitable
+from numpy.typing import ArrayLike
 
 from stokes.fmm.kernels import (
     Kernel,
@@ -20,6 +24,8 @@ from stokes.fmm.kernels import (
     stresslet,
     stresslet_pressure,
 )
+
+Quantity = Literal["velocity", "pressure", "stress"]
 
 
 @register_jitable
@@ -54,3 +60,46 @@ LAYER_KERNELS = {
     "pressure": (stokeslet_pressure, stresslet_pressure),
     "stress": (stokes_stress, stresslet_stress),
 }
+
+# Powers of 1/r in each quantity's kernels, above the first: single layer, double layer.
+_ORDER = {"velocity": (0, 1), "pressure": (1, 2), "stress": (1, 2)}
+_ROWS = {"velocity": 3, "pressure": 1, "stress": 6}
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Potential whose near part is wanted: a (single layer) + b (double layer) of each body.
+
+    single, double : a and b, one number for all bodies or one for each (`stokes.sources`); None
+                     leaves a layer out
+    """
+
+    single: ArrayLike | None = 1.0
+    double: ArrayLike | None = None
+    quantity: Quantity = "velocity"
+
+    def __post_init__(self) -> None:
+        if self.single is None and self.double is None:
+            raise ValueError("Layers: a single or a double layer must be given")
+        if self.quantity not in LAYER_KERNELS:
+            raise ValueError(f"quantity {self.quantity!r}: must be one of {tuple(LAYER_KERNELS)}")
+
+    @property
+    def order(self) -> int:
+        """Order of the strongest kernel: 0 for 1/r, 1 for 1/r^2, 2 for 1/r^3."""
+        single, double = _ORDER[self.quantity]
+        return single if self.double is None else double
+
+    @property
+    def kernels(self) -> tuple[Kernel | None, Kernel | None]:
+        """The kernels of the sums over sources; None for a layer that is left out."""
+        single, double = LAYER_KERNELS[self.quantity]
+        return (
+            None if self.single is None else single,
+            None if self.double is None else double,
+        )
+
+    @property
+    def rows(self) -> int:
+        """Components of the quantity: 3, 1 or 6."""
+        return _ROWS[self.quantity]
