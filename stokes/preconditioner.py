@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
@@ -12,10 +12,14 @@ from stokes.suspension_layout import Field, Layout
 
 
 class Preconditioner(Protocol):
-    """A linear map from residuals to unknowns, the same at every call.
+    """A map from residuals to unknowns, linear and the same at every call unless `flexible`.
 
     What a residual and an unknown are, and in which frames and units, `suspension_layout` says.
+
+    flexible : whether it changes a little from call to call, as one that iterates itself does
     """
+
+    flexible: bool
 
     def apply(self, residual: Field) -> Field:
         """Collective. Approximate unknowns of a residual; `rigid` is None if it is given as None.
@@ -28,8 +32,10 @@ class Preconditioner(Protocol):
 class BodyPreconditioner:
     """The exact inverse of every body alone in the fluid."""
 
-    def __init__(self, layout: Layout, solvers: Sequence[ShapeSolver]) -> None:
-        """Take the bodies of this rank and the solver of every shape."""
+    flexible = False
+
+    def __init__(self, layout: Layout, solvers: Mapping[int, ShapeSolver]) -> None:
+        """Take the bodies of this rank and the solver of each of their shapes."""
         self._layout, self._solvers = layout, solvers
 
     def apply(self, residual: Field) -> Field:

@@ -44,7 +44,7 @@ from stokes.suspension_options import (
 )
 from stokes.suspension_problem import Function, Problem, Request, SurfaceData, pose
 from stokes.suspension_scene import Scene
-from stokes.suspension_solution import SuspensionSolution, in_given_order, moments
+from stokes.suspension_solution import DisturbedFlow, SuspensionSolution, in_given_order, moments
 from stokes.suspension_surfaces import OwnSurfaces
 from stokes.suspension_table import distribute
 
@@ -93,7 +93,7 @@ class Suspension:
         self._cache = OperatorCache()
         self._solvers: dict[int, ShapeSolver] = {}
         self._operator: SuspensionOperator | None = None
-        self._preconditioner: Preconditioner | None = None
+        self._preconditioners: dict[bool, Preconditioner] = {}
 
     def _check(self) -> None:
         check_tolerance("tolerance", self.tolerance)
@@ -116,12 +116,23 @@ class Suspension:
         turned = [scene.table.body(own[k]) for k in order]
         return OwnSurfaces(layout, scene.shapes, turned, [self.bodies[k] for k in order])
 
+    @property
+    def _shapes(self) -> list[UnitShape]:
+        """Shapes of this rank's bodies, in the layout's order."""
+        groups = self._surfaces.layout.groups
+        return [self._scene.shapes[g.shape] for g in groups for _ in range(g.count)]
+
     # ---- what is known before any solution ---------------------------------------------------
 
     @property
     def nodes(self) -> NDArray:
         """Nodes (n, 3) of this rank in the world, body after body as they were given."""
         return self._surfaces.points[self._surfaces.given_order]
+
+    @property
+    def normals(self) -> NDArray:
+        """Outward unit normals (n, 3) at `nodes`, in the world."""
+        return self._surfaces.to_world(self._surfaces.normals)[self._surfaces.given_order]
 
     @property
     def weights(self) -> NDArray:
@@ -133,6 +144,13 @@ class Suspension:
         """First of `nodes` of each body as given, and their number behind: (b + 1,)."""
         sizes = np.diff(self._surfaces.layout.offsets)
         return np.concatenate([[0], np.cumsum(sizes[self._surfaces.layout.rows])])
+
+    @property
+    def grids(self) -> NDArray:
+        """(b, 2): nodes on the meridian and azimuths of each body as given."""
+        layout = self._surfaces.layout
+        grids = [group.grid for group in layout.groups for _ in range(group.count)]
+        return np.array(grids, dtype=np.int64).reshape(-1, 2)[layout.rows]
 
     @property
     def report(self) -> SuspensionReport:
@@ -211,6 +229,7 @@ class Suspension:
         rigid = np.sqrt(self._surfaces.area)[:, None] / _DRAG
         n = 3 * self._surfaces.layout.nodes
         freely = right_side.rigid is not None
+        preconditioner = self._preconditioner(freely)
 
         def flat(field: Field, weighted: bool) -> NDArray:
             parts = [field.nodal * nodal if weighted else field.nodal]
@@ -227,7 +246,7 @@ class Suspension:
 
         def correction(residual: NDArray) -> NDArray:
             with self._clock.phase("preconditioner"):
-                return flat(self._preconditioner.apply(field(residual, True)), False)
+                return flat(preconditioner.apply(field(residual, True)), False)
 
         result = gmres(
             operator=lambda x: flat(self._operator.apply(field(x, False)), True),
@@ -236,7 +255,7 @@ class Suspension:
             tolerance=self.tolerances.residual,
             max_iterations=self.options.max_iterations,
             restart=self.options.restart,
-            flexible=False,
+            flexible=preconditioner.flexible,
             parallel=self.parallel,
         )
         return result, field(result.unknown, False)
@@ -252,28 +271,40 @@ class Suspension:
             pair = surfaces.rotation @ np.swapaxes(motion.reshape(-1, 2, 3), 1, 2)
             velocities, spins = pair[:, :, 0], pair[:, :, 1] / surfaces.scale[:, None]
         order, at_nodes = surfaces.layout.order, surfaces.given_order
-        mu = found.double_layer
+        mu = found.double
+        flow = DisturbedFlow(
+            surfaces.bodies,
+            [s.resolution for s in self._shapes],
+            found.single,
+            mu,
+            self.background,
+            self.viscosity,
+            min(self.tolerances.near, self.tolerances.fmm),
+            self.options.fmm,
+            self.parallel,
+        )
         return SuspensionSolution(
             forces=in_given_order(found.forces, order),
             torques=in_given_order(found.torques, order),
             stresslets=in_given_order(found.stresslets, order),
             velocities=None if velocities is None else in_given_order(velocities, order),
             angular_velocities=None if spins is None else in_given_order(spins, order),
-            single_layer=found.single_layer[at_nodes],
-            double_layer=None if mu is None else mu[at_nodes],
+            single_layer=surfaces.to_world(found.single)[at_nodes],
+            double_layer=None if mu is None else surfaces.to_world(mu)[at_nodes],
             density=unknown.nodal,
             iterations=result.iterations,
             residuals=result.residuals,
             converged=result.converged,
             reason=result.reason,
             report=self.report,
+            flow=flow,
         )
 
     # ---- operators ---------------------------------------------------------------------------
 
     def _prepare(self) -> None:
         """Collective. Make operators, plans and preconditioner, once."""
-        if self._preconditioner is not None:
+        if self._operator is not None:
             return
         for group in self._surfaces.layout.groups:
             shape = self._scene.shapes[group.shape]
@@ -295,11 +326,30 @@ class Suspension:
             self._clock,
             self.parallel,
         )
-        with self._clock.phase("preconditioner"):
-            self._preconditioner = self._make_preconditioner()
 
-    def _make_preconditioner(self) -> Preconditioner:
-        return BodyPreconditioner(self._surfaces.layout, self._solvers)
+    def _preconditioner(self, free: bool) -> Preconditioner:
+        """Collective. The one for given loads (`free`) or given motions, made once."""
+        if free not in self._preconditioners:
+            with self._clock.phase("preconditioner"):
+                self._preconditioners[free] = self._make_preconditioner(free)
+        return self._preconditioners[free]
+
+    def _make_preconditioner(self, free: bool) -> Preconditioner:
+        alone = BodyPreconditioner(self._surfaces.layout, self._solvers)
+        if self.options.preconditioner == "body":
+            return alone
+        from stokes.schwarz import NeighbourSchwarz
+
+        return NeighbourSchwarz(
+            alone,
+            self._surfaces.layout,
+            self._scene.table,
+            self._solvers,
+            self.formulation,
+            self._cache,
+            self.parallel,
+            free,
+        )
 
     def _members(self) -> tuple[Members, dict[int, NDArray]]:
         """Bodies of this rank, and those of other ranks that its nodes are close to."""

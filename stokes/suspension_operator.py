@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dem_mpi.parallel import Halo, Parallel
-from stokes.fmm import Fmm, Kernel
+from stokes.fmm import Fmm, FmmOptions, Kernel
 from stokes.formulation import ShapeSolver
 from stokes.geometry import Body, Resolution
 from stokes.near import Layers, NearField
@@ -31,6 +31,8 @@ from stokes.suspension_options import SuspensionOptions, Tolerances
 from stokes.suspension_surfaces import OwnSurfaces
 
 Map = Callable[[NDArray], NDArray]
+# Errors of fast sums that interpolate end here, by round-off of their transfers.
+_LEAST_FAST = 5e-11
 
 
 class PhaseClock:
@@ -100,6 +102,13 @@ class Ghosts:
         return values
 
 
+def sum_options(options: FmmOptions, tolerance: float) -> FmmOptions:
+    """These options, of direct sums where no fast one reaches the tolerance."""
+    if tolerance >= _LEAST_FAST or options.order is not None or options.backend != "own":
+        return options
+    return replace(options, backend="direct")
+
+
 @dataclass(frozen=True)
 class Members:
     """Bodies that densities stand on: this rank's in the layout's order, then ghosts.
@@ -145,9 +154,10 @@ class SuspensionOperator:
                 self._layout.body_of_node,
                 options.threads,
             )
+        fmm = sum_options(options.fmm, tolerances.fmm)
         with clock.phase("fmm plan"):
             self.sums = tuple(
-                (weights, Fmm(kernel, points, None, tolerances.fmm, options.fmm, parallel))
+                (weights, Fmm(kernel, points, None, tolerances.fmm, fmm, parallel))
                 for weights, kernel in self._kernels()
             )
 

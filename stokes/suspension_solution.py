@@ -6,11 +6,65 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from dem_mpi.parallel import Parallel
+from stokes.background import BackgroundFlow
+from stokes.evaluate import evaluate
+from stokes.fmm import FmmOptions
 from stokes.formulation import ShapeSolver
+from stokes.geometry import Body, Resolution
+from stokes.near import Quantity
+from stokes.suspension_operator import sum_options
 from stokes.suspension_options import SuspensionReport
 from stokes.suspension_surfaces import OwnSurfaces
+
+
+@dataclass(frozen=True)
+class DisturbedFlow:
+    """The background flow and what the bodies make of it, up to their surfaces.
+
+    bodies, resolutions : this rank's
+    single, double : (n, 3) rho and mu at their nodes, in the bodies' frames, as `evaluate` has them
+    """
+
+    bodies: Sequence[Body]
+    resolutions: Sequence[Resolution]
+    single: NDArray
+    double: NDArray | None
+    background: BackgroundFlow | None
+    viscosity: float
+    tolerance: float
+    fmm: FmmOptions
+    parallel: Parallel
+
+    def velocity(self, points: ArrayLike) -> NDArray:
+        """Collective. Velocities (m, 3) at points (m, 3) of this rank; NaN inside bodies."""
+        values = self._evaluated(points, "velocity")
+        if self.background is not None:
+            values += self.background.velocity(points)
+        return values
+
+    def pressure(self, points: ArrayLike) -> NDArray:
+        """Collective. Pressures (m,) at points (m, 3) of this rank; NaN inside bodies."""
+        values = self._evaluated(points, "pressure")
+        if self.background is not None:
+            values += self.background.pressure(points, self.viscosity)
+        return values
+
+    def _evaluated(self, points: ArrayLike, quantity: Quantity) -> NDArray:
+        return evaluate(
+            self.bodies,
+            self.resolutions,
+            points,
+            self.single,
+            self.double,
+            quantity,
+            self.viscosity,
+            self.tolerance,
+            self.parallel,
+            sum_options(self.fmm, self.tolerance),
+        )
 
 
 @dataclass(frozen=True)
@@ -31,6 +85,7 @@ class SuspensionSolution:
                       every iteration
     converged       : whether the last is at most the residual's tolerance; reason: why it ended
     report          : of the suspension, after this solution
+    flow            : velocity and pressure anywhere
     """
 
     forces: NDArray
@@ -46,20 +101,29 @@ class SuspensionSolution:
     converged: bool
     reason: str
     report: SuspensionReport
+    flow: DisturbedFlow
+
+    def velocity(self, points: ArrayLike) -> NDArray:
+        """Collective. Velocities (m, 3) at points (m, 3) of this rank; NaN inside bodies."""
+        return self.flow.velocity(points)
+
+    def pressure(self, points: ArrayLike) -> NDArray:
+        """Collective. Pressures (m,) at points (m, 3) of this rank; NaN inside bodies."""
+        return self.flow.pressure(points)
 
 
 @dataclass(frozen=True)
 class SurfaceMoments:
     """Of bodies in the layout's order: forces, torques (b, 3), stresslets (b, 3, 3), the world's.
 
-    single_layer, double_layer : (n, 3) rho and mu in the world's frame
+    single, double : (n, 3) rho and mu of the world, in the bodies' frames
     """
 
     forces: NDArray
     torques: NDArray
     stresslets: NDArray
-    single_layer: NDArray
-    double_layer: NDArray | None
+    single: NDArray
+    double: NDArray | None
 
 
 def moments(
@@ -80,13 +144,12 @@ def moments(
     stresslet = -_symmetric_traceless(surfaces.sum_over_bodies(weights[:, None, None] * dipole))
     turn = surfaces.rotation
     unit = viscosity * a[:, None]
-    rho = surfaces.to_world(viscosity / surfaces.per_body(a)[:, None] * single)
     return SurfaceMoments(
         forces=unit * np.einsum("bij,bj->bi", turn, force),
         torques=unit * a[:, None] * np.einsum("bij,bj->bi", turn, torque),
         stresslets=(unit * a[:, None])[:, :, None] * (turn @ stresslet @ np.swapaxes(turn, 1, 2)),
-        single_layer=rho,
-        double_layer=None if double is None else surfaces.to_world(double),
+        single=viscosity / surfaces.per_body(a)[:, None] * single,
+        double=double,
     )
 
 
