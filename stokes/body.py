@@ -27,6 +27,7 @@ from stokes.formulation import Formulation, OperatorCache, ShapeSolver
 from stokes.geometry import Body, Meridian, Resolution, SurfaceGrid
 from stokes.modes import azimuths
 from stokes.quadrature import gauss_legendre
+from stokes.resolution import resolution_for
 
 Array = NDArray[np.float64]
 Slip = ArrayLike | Callable[[Array], Array]
@@ -234,8 +235,6 @@ def _solver(
     cache: OperatorCache | None,
 ) -> ShapeSolver:
     if resolution is None:
-        from stokes.resolution import resolution_for
-
         resolution = resolution_for(body.curve, tolerance)
     cache = OperatorCache() if cache is None else cache
     return cache.solver(body.curve, resolution, formulation)

@@ -448,7 +448,7 @@ class PointForcesInSpheroid:
         inside = rng.standard_normal((5, 3))
         inside *= np.array([0.3, 0.3, 0.8]) / np.linalg.norm(inside, axis=1)[:, None]
         self.flow = PointForces(self.body.to_world(inside), rng.standard_normal((5, 3)))
-        theta, phi = np.meshgrid(np.linspace(0, np.pi, 9), 2 * np.pi * np.arange(8) / 8)
+        theta, phi = np.meshgrid(np.linspace(0, np.pi, 6), 2 * np.pi * np.arange(5) / 5)
         self.outside = np.column_stack(
             [
                 0.7 * (np.sin(theta) * np.cos(phi)).ravel(),
@@ -470,17 +470,18 @@ class PointForcesInSpheroid:
 @pytest.mark.parametrize("formulation", EXTERIOR)
 def test_error_outside_falls_spectrally_with_modes_to_1e12(formulation):
     experiment = PointForcesInSpheroid()
-    modes = np.array([10, 20, 30, 40, 50, 60])
+    modes = np.array([8, 16, 24, 32, 40])
     errors = np.array(
         [
-            experiment.error(formulation, Resolution.uniform(8, 16, int(n)), OperatorCache())
+            experiment.error(formulation, Resolution.uniform(12, 16, int(n)), OperatorCache())
             for n in modes
         ]
     )
     assert errors[-1] < 1e-12, errors
-    # Point forces at 0.6 of the radius: the modes of the data fall like 0.6^n, ten by 1/165.
+    # The rings of point forces and targets nearest to the surface, 0.3 and 0.7 of 0.5, let modes
+    # fall like (3/7)^n on the way out: eight by 1/900.
     steps = errors[1:] / errors[:-1]
-    assert np.all(steps[errors[1:] > 1e-12] < 0.02), errors
+    assert np.all(steps[errors[1:] > 1e-12] < 0.01), errors
 
 
 def test_error_outside_falls_with_high_order_in_panels():
