@@ -120,7 +120,7 @@ class Curve(ABC):
         """Return (r(s) - r(t), z(s) - z(t)) to relative precision, also as s -> t."""
         s, t = np.broadcast_arrays(np.asarray(s, float), np.asarray(t, float))
         here, there = self.evaluate(s), self.evaluate(t)
-        dr, dz = here.r - there.r, here.z - there.z
+        dr, dz = np.asarray(here.r - there.r), np.asarray(here.z - there.z)
         close = np.abs(s - t) < self.reach
         if close.any():
             u, w = self._between(s[close], t[close])
@@ -136,8 +136,8 @@ class Curve(ABC):
         s, t = np.broadcast_arrays(np.asarray(s, float), np.asarray(t, float))
         here, there = self.evaluate(s), self.evaluate(t)
         dr, dz = here.r - there.r, here.z - there.z
-        at_s = here.normal_r * dr + here.normal_z * dz
-        at_t = there.normal_r * dr + there.normal_z * dz
+        at_s = np.asarray(here.normal_r * dr + here.normal_z * dz)
+        at_t = np.asarray(there.normal_r * dr + there.normal_z * dz)
         close = np.abs(s - t) < self.reach
         if close.any():
             # Taylor's remainder: gamma(s) - gamma(t) = gamma'(s) (s - t) - int_t^s (u - t) gamma''
@@ -147,7 +147,8 @@ class Curve(ABC):
                 (at_s, here, t[close][..., None] - u),
                 (at_t, there, s[close][..., None] - u),
             ):
-                n_r, n_z = ends.normal_r[close][..., None], ends.normal_z[close][..., None]
+                n_r = np.asarray(ends.normal_r)[close][..., None]
+                n_z = np.asarray(ends.normal_z)[close][..., None]
                 bend = n_r * points.d2r + n_z * points.d2z
                 offsets[close] = np.sum(w * lever * bend, axis=-1)
         return at_s, at_t
@@ -302,7 +303,7 @@ class Spherocylinder(Curve):
         if np.abs(misfit(found.x)).max() > 1e-12 * (self.radius + self.half_length) or b > half:
             raise ValueError(
                 f"spherocylinder({self.radius}, {self.half_length}, smoothing={self.smoothing}): "
-                "the cylinder is too short for this smoothing"
+                "no curvature found that gives this radius and length"
             )
         return float(b), float(half)
 
@@ -417,7 +418,8 @@ def spherocylinder(radius: float, half_length: float, smoothing: float = 0.2) ->
     """Return a rod: a cylinder of length 2 x `half_length` with caps of `radius`.
 
     `smoothing` is the width, in radii, over which the curvature of a cap goes to zero. Radius and
-    total length are exact. ValueError if the cylinder is too short for the smoothing.
+    total length are exact. All three > 0, smoothing at
+    most 1/2: else ValueError.
     """
     if not (radius > 0 and half_length > 0 and 0 < smoothing <= 0.5):
         raise ValueError(
@@ -453,7 +455,8 @@ def spline_curve(r: ArrayLike, z: ArrayLike) -> SplineCurve:
 def _checked(curve: Curve) -> Curve:
     """Return the curve if it bounds a body of genus 0; ValueError says what is wrong."""
     edges = np.array(curve.breaks)
-    s = (edges[:-1, None] + np.diff(edges)[:, None] * np.linspace(0, 1, 257)[:-1]).ravel()[1:]
+    samples = 8 + 512 // (len(edges) - 1)
+    s = (edges[:-1, None] + np.diff(edges)[:, None] * np.arange(samples) / samples).ravel()[1:]
     points, ends = curve.evaluate(s), curve.evaluate(np.array([0.0, 1.0]))
     if not (ends.z[0] > ends.z[1]):
         raise ValueError("curve must run from the north pole (greater z) to the south pole")

@@ -108,7 +108,7 @@ class ResolutionLadder:
         for j, (pole, side) in enumerate(self.gaps):
             if np.all(gaps >= np.where(polar, pole, side) * radius * _SLACK):
                 return j
-        k = int(np.argmin(gaps))
+        k = int(np.argmin(gaps / np.where(polar, *np.min(self.gaps, axis=0))))
         raise ValueError(
             f"resolution: no level for the gap {gaps[k]:.3g} at s = {s[k]:.3g} of {self.curve}"
         )
@@ -143,8 +143,7 @@ class ResolutionLadder:
         s = (edges[:-1, None] + np.diff(edges)[:, None] * np.linspace(0.05, 0.95, 10)).ravel()
         points = self.curve.evaluate(s)
         D = _image_distance(points, side)[1]
-        source_r, source_z = points.r + D * points.normal_r, points.z + D * points.normal_z
-        rings = np.hypot(points.r - source_r, points.z - source_z) ** 2 / (points.r * source_r)
+        rings = D**2 / (points.r * np.maximum(points.r + D * points.normal_r, _POLAR * D))
         ends = self.curve.evaluate(np.array([0.0, 1.0]))
         D = _image_distance(ends, pole)[1]
         off_axis = (points.r[:, None] - _POLAR * D) ** 2
