@@ -73,9 +73,23 @@ _IDENTITY = {
 class ShapeSolver:
     """One formulation on one unit shape at one resolution.
 
-    `matrices` (modes + 1, 3 n_s, 3 n_s) are the operator's in the real form of `stokes.modes`;
-    factorisations and plain-rule blocks are made when first asked for and kept. Every method takes
+    Factorisations and plain-rule blocks are made when first asked for and kept. Every method takes
     any number of fields at once on a trailing axis.
+
+    eta : weight of the single layer in `combined` and `completed`. At 1.5 `combined` is best
+    conditioned on the sphere and within 5 % of best elsewhere. Condition numbers in the norm of L2
+    on the surface, worst over the modes, independent of the resolution (of `single`, with 64 nodes
+    on the meridian; it doubles with their number and more next to the poles):
+
+                            combined   completed   traction   interior   single
+        sphere                  2.0        5.0         5.0        2.5     1.6e3
+        spheroid 0.5 : 1        3.2         14          13        7.3     1.6e3
+        spheroid 1 : 0.5        2.6         11          11        5.4     1.5e3
+        spheroid 1 : 5          6.4        116
+        rod, aspect 5           4.5        114
+
+    On slender bodies `completed` and `traction` suffer, as bending motions, too, nearly solve
+    (1/2 + D) q = 0; a single layer all over the surface makes that good.
     """
 
     def __init__(
@@ -89,9 +103,6 @@ class ShapeSolver:
         self.eta = float(eta)
         self.grid = operators.grid
         self.length = math.sqrt(self.grid.area / (4.0 * math.pi))
-        layers = {kind: operators.matrices(kind) for kind in _KINDS[self.formulation]}
-        self.matrices = self._compose(layers)
-        self._add_identity_and_lift()
         self._corrections: dict[tuple[int, int], Array] = {}
 
     # ---- the operator ------------------------------------------------------------------------
@@ -126,6 +137,8 @@ class ShapeSolver:
         refinement = tuple(refinement)
         if refinement not in self._corrections:
             self._corrections[refinement] = self.matrices - self._plain(refinement)
+            # An iteration needs this and the factorisation, no longer the matrices themselves.
+            del self.matrices
         return self._multiply(self._corrections[refinement], density)
 
     @property
@@ -223,11 +236,21 @@ class ShapeSolver:
 
     # ---- matrices ----------------------------------------------------------------------------
 
+    @cached_property
+    def matrices(self) -> Array:
+        """The operator (modes + 1, 3 n_s, 3 n_s) in the real form of `stokes.modes`."""
+        kinds = _KINDS[self.formulation]
+        matrices = self._compose({kind: self.operators.matrices(kind) for kind in kinds})
+        self._add_identity_and_lift(matrices)
+        return matrices
+
     @property
     def nbytes(self) -> int:
         """Bytes of matrices and factorisations held by this object."""
-        factors = self.__dict__.get("_factors", ())
-        held = [self.matrices, *self._corrections.values(), *(lu for lu, _ in factors)]
+        held = list(self._corrections.values())
+        held += [lu for lu, _ in self.__dict__.get("_factors", ())]
+        if "matrices" in self.__dict__:
+            held.append(self.matrices)
         return sum(array.nbytes for array in held)
 
     def condition_numbers(self) -> Array:
@@ -270,19 +293,18 @@ class ShapeSolver:
             total[n] += single[n] @ projection
         return total
 
-    def _add_identity_and_lift(self) -> None:
-        diagonal = np.arange(self.matrices.shape[1])
-        self.matrices[:, diagonal, diagonal] += _IDENTITY[self.formulation]
+    def _add_identity_and_lift(self, matrices: Array) -> None:
+        diagonal = np.arange(matrices.shape[1])
+        matrices[:, diagonal, diagonal] += _IDENTITY[self.formulation]
         if self.formulation in (Formulation.SINGLE, Formulation.INTERIOR):
             meridian = self.operators.meridian
             n = np.concatenate([meridian.normal_r, np.zeros(meridian.size), meridian.normal_z])
-            lift = np.outer(n, n * self._line_weights) / self._line_weights[: meridian.size].sum()
-            self.matrices[0] += lift * (
-                self.length if self.formulation is Formulation.SINGLE else 1.0
-            )
+            weight = self.length if self.formulation is Formulation.SINGLE else 1.0
+            area = self._line_weights[: meridian.size].sum()
+            matrices[0] += np.outer(weight / area * n, n * self._line_weights)
         elif self.formulation is Formulation.TRACTION:
             for n, projection in enumerate(self._projections()):
-                self.matrices[n] += projection
+                matrices[n] += projection
 
     def _projections(self) -> list[Array]:
         """P in modes 0 and 1, the only ones of rigid motions; (3 n_s, 3 n_s) each."""
