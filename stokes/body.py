@@ -147,7 +147,7 @@ def solve_resistance(
     """
     formulation = Formulation(formulation)
     if formulation in (Formulation.INTERIOR, Formulation.TRACTION):
-        raise ValueError(f"formulation {formulation}: has no resistance problem")
+        raise ValueError(f"formulation {formulation}: no motion is given to the body")
     solver = _solver(body, formulation, resolution, tolerance, cache)
     field = _prescribed(body, solver.grid, background, slip)
     motion = np.concatenate(
@@ -216,6 +216,7 @@ def resistance_matrix(
     """(6, 6): force and torque to apply for a velocity and an angular velocity, world's frame.
 
     Symmetric and positive definite, to the accuracy of the solution (it is not symmetrised).
+    Arguments as `solve_resistance`.
     """
     solver = _solver(body, Formulation(formulation), resolution, tolerance, cache)
     turn = np.kron(np.eye(2), body.rotation)

@@ -182,8 +182,11 @@ class ShapeSolver:
 
     @cached_property
     def resistance(self) -> Array:
-        """(6, 6): force and torque exerted for unit velocities and rotations, viscosity 1."""
-        return self._grand_resistance[1]
+        """(6, 6): force and torque to apply for unit velocities and rotations, viscosity 1.
+
+        Raises ValueError in the formulations `interior` and `traction`.
+        """
+        return self._unit_motions[1]
 
     def solve_mobility(
         self, field: Array, force: ArrayLike = (0.0,) * 3, torque: ArrayLike = (0.0,) * 3
@@ -193,7 +196,8 @@ class ShapeSolver:
         Solves A q - K V = field, B rho(q) = (force, torque), the loads applied to the body;
         `field` (n_s, n_theta, 3[, m]) is the slip minus the flow without the body. In the
         formulation `traction` it is minus the traction of the flow without the body, and V does
-        not hold the mean of that flow. Loads (3[, m]) of the unit shape at viscosity 1.
+        not hold the mean of that flow. Loads (3[, m]) of the unit shape at viscosity 1. Raises
+        ValueError in the formulation `interior`.
         """
         fields = np.shape(field)[3:]
         load = np.concatenate(
@@ -201,12 +205,11 @@ class ShapeSolver:
         )
         if self.formulation is Formulation.TRACTION:
             return self._solve_traction(field, load)
-        single_layer, _ = self.layers(self.solve(field))
-        if single_layer is None:
-            raise ValueError("the interior formulation has no mobility problem")
-        _, resistance = self._grand_resistance
-        motion = np.linalg.solve(resistance, load - self.loads(single_layer))
-        density = self.solve(field + np.tensordot(self.rigid_motions, motion, axes=1))
+        unit_densities, resistance = self._unit_motions
+        density = self.solve(field)
+        missing = load - self.loads(self.layers(density)[0])
+        motion = np.linalg.solve(resistance, missing)
+        density += np.tensordot(unit_densities, motion, axes=1)
         return density, motion[:3], motion[3:]
 
     def _solve_traction(self, field: Array, load: Array) -> tuple[Array, Array, Array]:
@@ -218,12 +221,12 @@ class ShapeSolver:
         return density, motion[:3], motion[3:]
 
     @cached_property
-    def _grand_resistance(self) -> tuple[Array, Array]:
+    def _unit_motions(self) -> tuple[Array, Array]:
+        """Densities (n_s, n_theta, 3, 6) of the rigid motions K and the loads B of each, (6, 6)."""
+        if self.formulation in (Formulation.INTERIOR, Formulation.TRACTION):
+            raise ValueError(f"formulation {self.formulation}: no motion is given to the body")
         densities = self.solve(self.rigid_motions)
-        single_layer, _ = self.layers(densities)
-        if single_layer is None:
-            raise ValueError("the interior formulation has no resistance")
-        return densities, self.loads(single_layer)
+        return densities, self.loads(self.layers(densities)[0])
 
     @cached_property
     def _weighted_motions(self) -> Array:
@@ -333,7 +336,9 @@ class OperatorCache:
     An object of the caller: dropping it frees everything. `nbytes` tells what it holds.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, threads: int = 1) -> None:
+        """`threads` that assembly may use; any number gives the same bits."""
+        self.threads = threads
         self._operators: dict[Hashable, ModalOperators] = {}
         self._solvers: dict[Hashable, ShapeSolver] = {}
 
@@ -341,7 +346,7 @@ class OperatorCache:
         """The layer potentials of this shape at this resolution."""
         key = (curve, resolution)
         if key not in self._operators:
-            self._operators[key] = ModalOperators(curve, resolution)
+            self._operators[key] = ModalOperators(curve, resolution, self.threads)
         return self._operators[key]
 
     def solver(

@@ -549,9 +549,27 @@ def test_slip_with_a_net_flux_is_refused_where_the_layers_cannot_make_it(cache):
 
 
 @pytest.mark.parametrize("formulation", ["interior", "traction"])
-def test_formulations_without_a_resistance_problem_are_refused(formulation):
-    with pytest.raises(ValueError, match="no resistance problem"):
-        solve_resistance(Body(sphere()), (1.0, 0.0, 0.0), formulation=formulation)
+def test_formulations_that_take_no_motion_are_refused(formulation, cache):
+    options = {
+        "formulation": formulation,
+        "resolution": Resolution.uniform(2, 12, 2),
+        "cache": cache,
+    }
+    with pytest.raises(ValueError, match="no motion is given"):
+        solve_resistance(Body(sphere()), (1.0, 0.0, 0.0), **options)
+    with pytest.raises(ValueError, match="no motion is given"):
+        resistance_matrix(Body(sphere()), **options)
+
+
+def test_interior_formulation_moves_no_body(cache):
+    with pytest.raises(ValueError, match="no motion is given"):
+        solve_mobility(
+            Body(sphere()),
+            (1.0, 0.0, 0.0),
+            formulation="interior",
+            resolution=Resolution.uniform(2, 12, 2),
+            cache=cache,
+        )
 
 
 def test_slip_of_the_wrong_shape_and_slip_with_traction_are_refused(cache):
