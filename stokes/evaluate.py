@@ -229,14 +229,18 @@ class _CloseBodies:
         found = np.zeros(len(points), bool)
         if len(self.bodies) == 0 or len(points) == 0:
             return found
-        tree = cKDTree(points)
-        for body in self.bodies:
-            members = np.array(tree.query_ball_point(body.centre, body.bounding_radius), np.int64)
-            if len(members):
-                x, y, z = body.to_local(points[members]).T
-                depth, _ = distance(body.curve, np.hypot(x, y), z)
-                rounding = 1e-15 * np.abs(points[members]).max(axis=1) / body.scale
-                found[members[depth < -(_INSIDE + 8.0 * rounding)]] = True
+        s = self.surfaces
+        balls = [body.bounding_radius for body in self.bodies]
+        members = cKDTree(points).query_ball_point(s.centre, balls)
+        body = np.repeat(np.arange(s.bodies), [len(m) for m in members])
+        point = np.concatenate([np.asarray(m, np.int64) for m in members])
+        r, _, z = s.to_local(points[point], body)
+        depth = np.empty(len(point))
+        for h, shape in enumerate(s.shapes):
+            k = np.flatnonzero(s.shape[body] == h)
+            depth[k] = distance(shape.curve, r[k], z[k])[0]
+        rounding = 1e-15 * np.abs(points[point]).max(axis=1, initial=0.0) / s.scale[body]
+        found[point[depth < -(_INSIDE + 8.0 * rounding)]] = True
         return found
 
     def samples(self, wanted: Index, points: Array, tolerance: float, layers: Layers) -> _Samples:
@@ -276,20 +280,19 @@ class _CloseBodies:
 
     def _outward(self, points: Array, body: Index) -> Array:
         """Normals at the feet of points next to bodies, as long as the foot's panel."""
-        out = np.empty_like(points)
-        for b in np.unique(body).tolist():
-            members = np.flatnonzero(body == b)
-            x, y, z = self.bodies[b].to_local(points[members]).T
-            curve, edges = self.bodies[b].curve, np.array(self.resolutions[b].breaks)
-            _, s = distance(curve, np.hypot(x, y), z)
-            foot, theta = curve.evaluate(s), np.arctan2(y, x)
-            panel = np.clip(np.searchsorted(edges, s) - 1, 0, len(edges) - 2)
-            length = self.bodies[b].scale * np.diff(edges)[panel] * foot.speed
-            normal = np.column_stack(
-                [foot.normal_r * np.cos(theta), foot.normal_r * np.sin(theta), foot.normal_z]
-            )
-            out[members] = length[:, None] * self.bodies[b].vectors_to_world(normal)
-        return out
+        s = self.surfaces
+        r, theta, z = s.to_local(points, body)
+        normal = np.empty_like(points)
+        for h, shape in enumerate(s.shapes):
+            k = np.flatnonzero(s.shape[body] == h)
+            foot_s = distance(shape.curve, r[k], z[k])[1]
+            foot, edges = shape.curve.evaluate(foot_s), np.array(shape.resolution.breaks)
+            panel = np.clip(np.searchsorted(edges, foot_s) - 1, 0, len(edges) - 2)
+            length = np.diff(edges)[panel] * foot.speed
+            normal[k, 0] = length * foot.normal_r * np.cos(theta[k])
+            normal[k, 1] = length * foot.normal_r * np.sin(theta[k])
+            normal[k, 2] = length * foot.normal_z
+        return s.scale[body, None] * np.einsum("kij,kj->ki", s.rotation[body], normal)
 
     def corrections(self, points: Array, tolerance: float, threads: int) -> Array:
         """What the plain rules of these bodies miss, (m, rows)."""

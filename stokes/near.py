@@ -71,7 +71,7 @@ class NearField:
         """Find close pairs and make the blocks of those that need them. Not collective.
 
         bodies    : with the resolution of each: all that have targets within their `reach`
-        targets   : (t, 3) in the world, outside all bodies but their owner, or on them
+        targets   : (t, 3) in the world; on a surface the limit from outside is meant
         tolerance : of each panel's potential in its unit frame, relative to the largest density
         owner     : (t,) body that a target is a node of, which is left out; -1 for none
 
@@ -155,11 +155,10 @@ class _RefinedPanels:
         if self.targets.shape[1] == 0:
             return
         values = np.zeros((density.shape[2], out.shape[1], self.targets.shape[1]))
-        single, double = self.layers.kernels
-        if single is not None:
-            self._sum(single, self.sources.single_weights(density, self.layers.single), values)
-        if double is not None:
-            self._sum(double, self.sources.double_weights(density, self.layers.double), values)
+        weights = self.sources.weights(density, self.layers.single, self.layers.double)
+        for kernel, columns in zip(self.layers.kernels, weights, strict=True):
+            if kernel is not None:
+                self._sum(kernel, columns, values)
         self._scatter.add(values.transpose(2, 1, 0), out)
 
     def _sum(self, kernel: Kernel, weights: Array, values: Array) -> None:

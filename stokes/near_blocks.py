@@ -38,6 +38,8 @@ _ODD = {
     "pressure": (False,),
     "stress": (False, True, False, False, True, False),
 }
+# Targets less than this inside, by round-off of world coordinates, are on the surface.
+_ON_SURFACE = 1e-11
 # Points, a step apart, that a value on the surface is extrapolated from.
 _EXTRAPOLATED = 5
 
@@ -113,14 +115,15 @@ class PanelBlocks:
 
     def _gaps(self, gap: Array, step: Array) -> tuple[Array, Array]:
         """Distances from the surface to evaluate each entry at, and weights: (e, k) twice."""
+        side = np.where(gap < -_ON_SURFACE, -1.0, 1.0)
         if self.layers.order == 0:
             # on the surface: the limit from outside, to the error that the tolerance leaves
             least = 1e-3 * self.tolerance
-            return np.where(np.abs(gap) < least, least, gap), np.ones_like(gap)
+            return np.where(np.abs(gap) < least, side * least, gap), np.ones_like(gap)
         k = np.arange(_EXTRAPOLATED + 1)
         binomial = np.array([math.comb(_EXTRAPOLATED, i) for i in k])
         weights = np.where(k > 0, (-1.0) ** (k + 1) * binomial, 0.0)
-        return gap + k * step, np.where(gap < step, weights, k == 0)
+        return gap + side * k * step, np.where(np.abs(gap) < step, weights, k == 0)
 
     def add(self, density: Array, out: Array) -> None:
         """Add to out (t, rows, m)."""

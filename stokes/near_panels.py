@@ -103,7 +103,7 @@ class ClosePanels:
         s, gap, step = _feet(surfaces, shape, r, z, np.unique(pair[by[:, 0] == 0]))
         if layers.order > 0:
             # all panels or none: each has singularities at its edges, which their sum has not
-            by[gap[pair] < step[pair]] = 0
+            by[np.abs(gap[pair]) < step[pair]] = 0
         return cls(target, body, r, theta, z, pair, missed - start[pair], by, s, gap, step)
 
 
@@ -124,10 +124,7 @@ def _within_reach(
     if owner is not None:
         others = owner[target] != body
         body, target = body[others], target[others]
-    offset = targets[target] - s.centre[body]
-    local = np.einsum("kij,ki->jk", s.rotation[body], offset) / s.scale[body]
-    x, y, z = local
-    return target, body, np.hypot(x, y), np.arctan2(y, x), z
+    return target, body, *s.to_local(targets[target], body)
 
 
 def _needed(

@@ -147,6 +147,12 @@ class Surfaces:
         first = np.concatenate([[0], np.cumsum(panels)])[:-1]
         return body, np.arange(len(body)) - np.repeat(first, panels)
 
+    def to_local(self, points: Array, body: NDArray[np.int64]) -> tuple[Array, Array, Array]:
+        """Cylindrical r, theta, z (k,) of world points (k, 3) in the unit frames of bodies (k,)."""
+        offset = points - self.centre[body]
+        x, y, z = np.einsum("kij,ki->jk", self.rotation[body], offset) / self.scale[body]
+        return np.hypot(x, y), np.arctan2(y, x), z
+
     def sources(self) -> PanelSources:
         """All nodes as sources of a fast sum."""
         return PanelSources(self, *self.all_panels())
@@ -213,27 +219,48 @@ class PanelSources:
         coefficient: a, one for all bodies or (b,). Sums of the other kernels of a point force with
         the same weights are its pressure and stress, for viscosity 1, per unit of length.
         """
-        return self._weights(density, coefficient, layers=1)
+        return self.weights(density, coefficient, None)[0]
 
     def double_weights(self, density: Array, coefficient: ArrayLike = 1.0) -> Array:
         """Weights (n, 6, m) of the kernel `stresslet` for b (D f); coefficient: b."""
-        return self._weights(density, coefficient, layers=2)
+        return self.weights(density, None, coefficient)[1]
 
-    def _weights(self, density: Array, coefficient: ArrayLike, layers: int) -> Array:
-        s = self.surfaces
-        # lengths of the world in the kernel (degree -1, -2) against lengths of the unit shape
-        factor = np.broadcast_to(coefficient, s.bodies) * s.scale**layers / (8.0 * math.pi)
-        fields = density.shape[2]
-        weights = np.empty((len(self.points), 3 * layers, fields))
+    def weights(
+        self, density: Array, single: ArrayLike | None, double: ArrayLike | None
+    ) -> tuple[Array | None, Array | None]:
+        """Both at once; None for a layer whose coefficient is None."""
+        count, fields = len(self.points), density.shape[2]
+        out = (
+            None if single is None else np.empty((count, 3, fields)),
+            None if double is None else np.empty((count, 6, fields)),
+        )
         for group in self._groups:
-            body, panel = self.body[group.members], self.panel[group.members]
-            fine = refine(self._gathered(density, group), group.by, group.upward)
-            fine = fine * (group.nodes.weights[panel] * factor[body, None])[..., None, None]
-            world = np.matmul(s.rotation[body][:, None], fine)
-            if layers == 2:
-                world = _stresslets(world, _turn(group.nodes.normals[panel], s.rotation[body]))
-            weights[self._rows(group.members)] = world.reshape(-1, 3 * layers, fields)
-        return weights
+            rows = self._rows(group.members)
+            vectors = self._vectors(density, group)
+            if single is not None:
+                # lengths of the world in a kernel of degree -1 against those of the unit shape
+                out[0][rows] = self._scaled(vectors, group, single, 1).reshape(-1, 3, fields)
+            if double is not None:
+                scaled = self._scaled(vectors, group, double, 2)
+                out[1][rows] = _stresslets(scaled, self._normals(group)).reshape(-1, 6, fields)
+        return out
+
+    def _vectors(self, density: Array, group: _Group) -> Array:
+        """Densities times weights of area over 8 pi, world components, (g, k, 3, m)."""
+        fine = refine(self._gathered(density, group), group.by, group.upward)
+        area = group.nodes.weights[self.panel[group.members]] / (8.0 * math.pi)
+        return self.surfaces.rotation[self.body[group.members]][:, None] @ (
+            fine * area[..., None, None]
+        )
+
+    def _scaled(self, vectors: Array, group: _Group, coefficient: ArrayLike, power: int) -> Array:
+        s = self.surfaces
+        factor = np.broadcast_to(coefficient, s.bodies) * s.scale**power
+        return vectors * factor[self.body[group.members], None, None, None]
+
+    def _normals(self, group: _Group) -> Array:
+        normals = group.nodes.normals[self.panel[group.members]]
+        return _turn(normals, self.surfaces.rotation[self.body[group.members]])
 
     def _gathered(self, density: Array, group: _Group) -> Array:
         """Nodal densities of panels (g, nodes, n_theta, 3, m)."""
