@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from dem_mpi.parallel import Parallel
 from stokes.background import BackgroundFlow
 from stokes.fmm._requests import raised_together
-from stokes.formulation import OperatorCache, ShapeSolver
+from stokes.formulation import DEFAULT_ETA, OperatorCache, ShapeSolver
 from stokes.geometry import Body
 from stokes.krylov import KrylovResult, gmres
 from stokes.near import Layers, reach
@@ -90,6 +90,7 @@ class Suspension:
                 self.bodies, self.tolerances.resolution, self.options, self.parallel
             )
             self._surfaces = self._own_surfaces()
+        self.tolerances = self.tolerances.for_gap(self._scene.least_gap, self.options)
         self._cache = OperatorCache()
         self._solvers: dict[int, ShapeSolver] = {}
         self._operator: SuspensionOperator | None = None
@@ -377,4 +378,4 @@ class Suspension:
         if self.formulation == "single":
             return Layers()
         lengths = [math.sqrt(shape.meridian.area / (4.0 * math.pi)) for shape in shapes]
-        return Layers(single=1.0 / np.array(lengths), double=1.0)
+        return Layers(single=DEFAULT_ETA / np.array(lengths), double=1.0)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from typing import Literal, get_args
 
@@ -16,7 +17,7 @@ PreconditionerName = Literal["body", "neighbours"]
 # Parts of the tolerance that each source of error is given. The residual's is the largest, as only
 # it costs iterations; the others cost digits that are cheap. Measured on random clusters.
 _RESIDUAL, _FMM, _NEAR, _RESOLUTION = 0.5, 0.2, 0.1, 0.2
-_LEAST = 1e-14  # no sum of thousands of terms is more accurate
+_LEAST = 2e-14  # no sum of thousands of terms is more accurate
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,19 @@ class Tolerances:
                 for name, (share, given) in parts.items()
             }
         )
+
+    def for_gap(self, gap: float, options: SuspensionOptions) -> Tolerances:
+        """The same with smaller ones for sums where densities are large and cancel.
+
+        gap : least gap, over the scale. Tractions in it grow like 1/gap^2 of the velocities, over
+        an area in proportion to it. Given tolerances are kept.
+        """
+        share = min(1.0, gap)
+        near = max(_LEAST, self.near * share) if options.near_tolerance is None else self.near
+        fmm = self.fmm
+        if options.fmm_tolerance is None:
+            fmm = max(_LEAST, self.fmm * math.sqrt(share))
+        return replace(self, near=near, fmm=fmm)
 
 
 @dataclass(frozen=True)
