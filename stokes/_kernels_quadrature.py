@@ -16,6 +16,7 @@ import numpy as np
 from dem_mpi._jit import jit
 
 LOG_AT_START, PLAIN, LOG_AT_END = -1, 0, 1
+_FAR = complex(0.0, 1e3)
 _SMALLEST = 1e-13  # of the parameter range: pieces shorter than this are not divided
 
 
@@ -83,6 +84,9 @@ def divide_panels(
         w = targets[i]
         touches = left <= t <= right
         mirrored = _roots(s[k], W[k], dW[k], d2W[k], complex(-w.real, w.imag))
+        if touches and w.real == 0.0:
+            # At a pole the two roots meet, and r' times the kernel is analytic.
+            mirrored[:] = _FAR
         if touches:
             direct = mirrored
         else:

@@ -130,6 +130,26 @@ def test_single_layer_of_legendre_functions_on_the_sphere():
         assert np.abs(error).max() < 1e-13
 
 
+def test_targets_at_panel_edges_and_poles():
+    meridian = Meridian(sphere(), Resolution.uniform(8, 16, 0))
+    s = np.array([0.0, 1e-9, 0.125, 0.5, 1.0])
+    rule = self_rule(meridian, s)
+    target = meridian.curve.evaluate(s)
+    plain = np.zeros((len(s), meridian.size))
+    for i in range(len(s)):
+        dr, dz = meridian.curve.differences(s[i], meridian.s)
+        plain[i] = ring_integral(0, target.r[i], meridian.r, dr, dz)
+    plain *= meridian.weights * meridian.r
+    source = rule.points[:, 0]
+    values = ring_integral(0, target.r[rule.target], source, *rule.difference.T)
+    operator = replaced(plain, meridian, rule, values * rule.weights * source)
+    for degree in (0, 5):
+        potential = operator @ eval_legendre(degree, meridian.z)
+        expected = 4 * np.pi / (2 * degree + 1) * eval_legendre(degree, target.z)
+        np.testing.assert_allclose(potential, expected, rtol=0, atol=1e-13)
+    assert np.bincount(rule.target).max() < 600
+
+
 def test_single_layer_converges_with_the_order_of_the_interpolated_density():
     degree, nodes = 24, 6
 
