@@ -79,6 +79,11 @@ class Curve(ABC):
     def evaluate(self, s: ArrayLike) -> CurvePoints:
         """Return the points at parameters s (any shape), with first and second derivatives."""
 
+    def derivatives(self, s: ArrayLike) -> tuple[Array, Array, Array, Array]:
+        """Return r', z', r'', z'' at parameters s (any shape)."""
+        points = self.evaluate(s)
+        return points.dr, points.dz, points.d2r, points.d2z
+
     @property
     def breaks(self) -> tuple[float, ...]:
         """Parameters 0 .. 1 between which the curve is analytic."""
@@ -124,8 +129,8 @@ class Curve(ABC):
         close = np.abs(s - t) < self.reach
         if close.any():
             u, w = self._between(s[close], t[close])
-            points = self.evaluate(u)
-            dr[close], dz[close] = np.sum(w * points.dr, axis=-1), np.sum(w * points.dz, axis=-1)
+            slope_r, slope_z, _, _ = self.derivatives(u)
+            dr[close], dz[close] = np.sum(w * slope_r, axis=-1), np.sum(w * slope_z, axis=-1)
         return dr, dz
 
     def normal_offsets(self, s: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
@@ -142,14 +147,14 @@ class Curve(ABC):
         if close.any():
             # Taylor's remainder: gamma(s) - gamma(t) = gamma'(s) (s - t) - int_t^s (u - t) gamma''
             u, w = self._between(s[close], t[close])
-            points = self.evaluate(u)
+            _, _, d2r, d2z = self.derivatives(u)
             for offsets, ends, lever in (
                 (at_s, here, t[close][..., None] - u),
                 (at_t, there, s[close][..., None] - u),
             ):
                 n_r = np.asarray(ends.normal_r)[close][..., None]
                 n_z = np.asarray(ends.normal_z)[close][..., None]
-                bend = n_r * points.d2r + n_z * points.d2z
+                bend = n_r * d2r + n_z * d2z
                 offsets[close] = np.sum(w * lever * bend, axis=-1)
         return at_s, at_t
 
@@ -345,17 +350,22 @@ class Spherocylinder(Curve):
         arc = 2 * half * sigma
         index = np.clip((arc / half * (len(edges) - 1)).astype(int), 0, len(edges) - 1)
         length = arc - edges[index]
-        phi, curvature = self._turned(arc, b, half)
         between, _ = self._turned(
             edges[index][..., None] + length[..., None] * _MEAN_NODES, b, half
         )
         r = anchor_r[index] + length * (np.cos(between) @ _MEAN_WEIGHTS)
         z = anchor_z[index] - length * (np.sin(between) @ _MEAN_WEIGHTS)
+        z = np.where(south, -z, z)
+        return CurvePoints(r, z, *self.derivatives(s))
+
+    def derivatives(self, s: ArrayLike) -> tuple[Array, Array, Array, Array]:
+        # Unlike r and z they need no integrals.
+        sigma, south = _mirror(s)
+        b, half = self._shape
+        phi, curvature = self._turned(2 * half * sigma, b, half)
         sign, speed = np.where(south, -1.0, 1.0), 2 * half
         # gamma' = |gamma'| (cos phi, -sin phi); the southern half is the northern one mirrored.
-        return CurvePoints(
-            r,
-            sign * z,
+        return (
             sign * speed * np.cos(phi),
             -speed * np.sin(phi),
             -(speed**2) * curvature * np.sin(phi),
