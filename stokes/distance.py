@@ -56,27 +56,42 @@ def gaps_of_pairs(bodies: Sequence[Body], pairs: ArrayLike) -> Gaps:
     pairs = np.ascontiguousarray(pairs, np.int64).reshape(-1, 2)
     curves = list(dict.fromkeys(body.curve for body in bodies))
     numbers = {curve: i for i, curve in enumerate(curves)}
-    found = Gaps(np.empty(len(pairs)), np.empty((len(pairs), 2)), np.empty((len(pairs), 2, 3)))
+    curve_of = np.array([numbers[body.curve] for body in bodies], np.int64)
     if len(pairs) == 0:
-        return found
+        return Gaps(np.empty(0), np.empty((0, 2)), np.empty((0, 2, 3)))
     tables = [curve.polynomials for curve in curves]
     samples = [_samples(curve) for curve in curves]
-    least_distances(
-        pairs,
+    arguments = (
         np.array([body.centre for body in bodies]),
         np.array([body.rotation for body in bodies]),
         np.array([body.scale for body in bodies]),
-        np.array([numbers[body.curve] for body in bodies]),
+        curve_of,
         np.array([_sphere_radius(curve) for curve in curves]),
         np.cumsum([0, *(len(series) for _, series in tables)]),
         np.concatenate([edges for edges, _ in tables]),
         np.concatenate([series for _, series in tables]),
         np.cumsum([0, *(block.shape[1] for block in samples)]),
         np.concatenate(samples, axis=1),
-        found.distance,
-        found.s,
-        found.points,
     )
+    found = _least_distances(pairs, arguments)
+    # Between dented bodies distances have many minima: they are sought from both surfaces.
+    dented = np.array([_is_dented(curve) for curve in curves])
+    again = np.flatnonzero(dented[curve_of[pairs]].any(axis=1) & (found.distance > 0))
+    back = _least_distances(np.ascontiguousarray(pairs[again, ::-1]), arguments)
+    nearer = back.distance < found.distance[again]
+    for values, others in (
+        (found.distance, back.distance),
+        (found.s, back.s[:, ::-1]),
+        (found.points, back.points[:, ::-1]),
+    ):
+        values[again[nearer]] = others[nearer]
+    return found
+
+
+def _least_distances(pairs: NDArray[np.int64], arguments: tuple) -> Gaps:
+    m = len(pairs)
+    found = Gaps(np.empty(m), np.empty((m, 2)), np.empty((m, 2, 3)))
+    least_distances(pairs, *arguments, found.distance, found.s, found.points)
     return found
 
 
@@ -105,6 +120,12 @@ def _samples(curve: Curve) -> Array:
     s = np.append((edges[:-1, None] + np.diff(edges)[:, None] * steps).ravel(), 1.0)
     points = curve.evaluate(s)
     return np.stack([s, points.r, points.z])
+
+
+def _is_dented(curve: Curve) -> bool:
+    """Whether the meridian is concave anywhere, but for rounding."""
+    bend = curve.evaluate(_samples(curve)[0]).meridional_curvature
+    return bool(bend.min() < -1e-9 * bend.max())
 
 
 def _sphere_radius(curve: Curve) -> float:

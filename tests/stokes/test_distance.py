@@ -125,6 +125,23 @@ def test_gap_does_not_depend_on_the_order_of_the_bodies():
     np.testing.assert_allclose(lengths, np.abs(there.distance), atol=1e-13)
 
 
+def test_gap_of_dented_bodies_is_the_least_of_both_ways():
+    curve = fourier_curve([1.0, 0.0, 0.6], [0.0, 1.2])
+    rng = np.random.default_rng(5)
+    first = [Body(curve, 1.0, (0.0, 0.0, 0.0), tuple(rng.normal(size=4))) for _ in range(30)]
+    second = [
+        Body(curve, 0.8, tuple(1.5 * rng.normal(size=3)), tuple(rng.normal(size=4)))
+        for _ in range(30)
+    ]
+    there, back = gaps(first, second), gaps(second, first)
+    apart = there.distance > 0
+    assert apart.sum() > 10
+    np.testing.assert_allclose(there.distance[apart], back.distance[apart], rtol=1e-12)
+    for i in np.flatnonzero(apart)[:3]:
+        twin = least_distance_twin(first[i], second[i], rng)
+        assert there.distance[i] < twin * (1 + 1e-9)
+
+
 @pytest.mark.parametrize("gap", [1e-1, 1e-3, 1e-6])
 def test_gap_of_coaxial_and_side_by_side_spheroids(gap):
     curve = spheroid(0.25, 1.0)
