@@ -296,6 +296,184 @@ def solve(
 
 
 @app.command(epilog=_EPILOG)
+def flow(
+    run: Annotated[Path, typer.Argument(help="Trajectory of a run.", metavar="RUN.h5")],
+    frame: Annotated[
+        str,
+        typer.Option(
+            "--frame",
+            metavar="last|N|TIME",
+            help="Frame by its number from 0, or the nearest to a time such as 0.5s.",
+        ),
+    ] = "last",
+    bodies: Annotated[
+        str | None,
+        typer.Option(
+            "--bodies", metavar="GIDS", help="Only these, e.g. '3 7-12 40'. [default: all]"
+        ),
+    ] = None,
+    region: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            "--region",
+            metavar="X0 X1 Y0 Y1 Z0 Z1",
+            help="Only bodies whose centres it holds, in m.",
+        ),
+    ] = None,
+    hydrodynamic_radius: Annotated[
+        str,
+        typer.Option(
+            "--hydrodynamic-radius",
+            metavar="auto|FACTOR",
+            help="Size of the bodies over that of the run; auto: as large as leaves a gap of a "
+            "hundredth of a radius, for touching bodies have no solution.",
+        ),
+    ] = "auto",
+    viscosity: Annotated[
+        float, typer.Option("--viscosity", help="Of the fluid, in Pa s; the default is water's.")
+    ] = 1e-3,
+    background: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--background",
+            metavar="FLOW",
+            help="Flow far away: uniform:ux,uy,uz, shear:rate[,xz], extension:rate[,z], "
+            "poiseuille:speed,half_width[,x], each with [@x,y,z] for its origin. May be repeated, "
+            "for the sum of flows. [default: at rest]",
+        ),
+    ] = None,
+    problem: Annotated[
+        str,
+        typer.Option(
+            "--problem",
+            metavar="resistance|mobility",
+            help="resistance: bodies move as in the run, loads of the fluid are asked for; "
+            "mobility: bodies feel their buoyant weights, motions are asked for.",
+        ),
+    ] = "resistance",
+    gravity: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(
+            "--gravity", metavar="X Y Z", help="For mobility, in m/s^2. [default: the run's]"
+        ),
+    ] = None,
+    fluid_density: Annotated[
+        float,
+        typer.Option(
+            "--fluid-density", help="For mobility, in kg/m^3: buoyancy; the default is water's."
+        ),
+    ] = 1000.0,
+    tolerance: Annotated[
+        float, typer.Option("--tolerance", help="Relative error of velocities.")
+    ] = 1e-4,
+    formulation: Annotated[
+        str,
+        typer.Option(
+            "--formulation",
+            metavar="single|combined",
+            help="Layers on the surfaces; combined is better conditioned at twice the work.",
+        ),
+    ] = "single",
+    max_iterations: Annotated[
+        int,
+        typer.Option("--max-iterations", min=1, help="Stop, not converged, after so many."),
+    ] = 300,
+    grid: Annotated[
+        str | None,
+        typer.Option(
+            "--grid", metavar="NX,NY,NZ", help="Also velocity and pressure on a grid of points."
+        ),
+    ] = None,
+    grid_box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        typer.Option(
+            "--grid-box",
+            metavar="X0 X1 Y0 Y1 Z0 Z1",
+            help="First and last points of the grid, in m. [default: around the bodies]",
+        ),
+    ] = None,
+    points: Annotated[
+        Path | None,
+        typer.Option(
+            "--points",
+            metavar="FILE",
+            help="Velocity and pressure at points in place of a grid: CSV with a header x,y,z, or "
+            "HDF5 with position.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", metavar="FLOW.h5", help="File to write. [default: flow.h5 beside RUN.h5]"
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace FLOW.h5 if it exists.")] = False,
+    render: Annotated[
+        Path | None,
+        typer.Option(
+            "--render",
+            metavar="PICTURE",
+            help="Draw speed and streamlines on a plane, as .png, .pdf or .svg (needs matplotlib).",
+        ),
+    ] = None,
+    plane: Annotated[
+        str,
+        typer.Option(
+            "--slice",
+            metavar="x|y|z[=PLACE]",
+            help="Plane of the picture, across an axis; without a place through the middle.",
+        ),
+    ] = "y",
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Say what it would take, nodes, memory, seconds, and end."),
+    ] = False,
+    threads: Annotated[int, typer.Option("--threads", min=1, help="Threads of a rank.")] = 1,
+) -> None:
+    """Stokes flow around the bodies of a frame: mpirun -n P dem-mpi flow RUN.h5.
+
+    Reads spheres, spheroids and rods, with their motions, and writes loads, motions, densities on
+    the surfaces and, if asked for, the flow on a grid into FLOW.h5, which ParaView opens. Ends with
+    0 if the tolerance holds and with 70 if it does not; the file then says so. There is no
+    checkpoint: a signal ends it at once, and leaves no file.
+    """
+    from dem_mpi.flow import flow_file
+    from dem_mpi.flow_options import parse_options
+    from dem_mpi.parallel import Parallel
+    from dem_mpi.solve import end_on_signals
+    from dem_mpi.warmup import set_threads
+
+    end_on_signals(STOP)
+    options = parse_options(
+        frame=frame,
+        bodies=bodies,
+        region=region,
+        hydrodynamic_radius=hydrodynamic_radius,
+        viscosity=viscosity,
+        background=background or (),
+        problem=problem,
+        gravity=gravity,
+        fluid_density=fluid_density,
+        tolerance=tolerance,
+        formulation=formulation,
+        max_iterations=max_iterations,
+        grid=grid,
+        box=grid_box,
+        points=points,
+        out=output,
+        force=force,
+        picture=render,
+        plane=plane,
+        dry_run=dry_run,
+        threads=threads,
+    )
+    set_threads(threads)
+    parallel = Parallel()
+    parallel.install_abort_hook()
+    raise typer.Exit(flow_file(parallel, run, options, _print))
+
+
+@app.command(epilog=_EPILOG)
 def warmup(
     threads: Annotated[
         int, typer.Option("--threads", min=1, help="Also compile the variants for threads.")

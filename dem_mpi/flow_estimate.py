@@ -1,0 +1,155 @@
+"""What a Stokes step would take, told from counts: nodes, memory, seconds. No clock is read.
+
+Nodes are exact: gaps between bodies and the tolerance decide them, and both are known before any
+work on surfaces. Memory is what matrices of shapes, GMRES's vectors, near corrections and fast sums
+take, with a base for interpreter and libraries. Seconds come from stored costs of one core of an
+AMD EPYC, single precision where the tolerance allows it: within a factor 2 on clusters of 8 to 125
+spheres, gaps 1e-2 and 1, tolerances 1e-3 to 1e-6. Iterations are the least certain part.
+
+Symbols: n nodes and b bodies of the fullest rank; n_s nodes on a meridian, M modes of a level.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dem_mpi.errors import InputError
+from dem_mpi.flow_options import FlowOptions
+from dem_mpi.h5files import readable_size
+from dem_mpi.parallel import Parallel
+
+if TYPE_CHECKING:
+    from stokes.suspension import Suspension
+
+# ---- memory [B] ----------------------------------------------------------------------------
+
+_BASE = 280 << 20  # interpreter, numpy, numba and its code, MPI, PETSc, HDF5
+_MATRICES = {"single": 2, "combined": 4}  # of a level at one time: assembled, and factored
+_VECTORS = 16  # beside those of GMRES's basis
+_SUM_NODE = {"single": 350, "combined": 800}
+_NEAR_NODE = 1600  # of bodies closer than a tenth of their size
+_FIELD_POINT = 500
+_DOUBT = 1.5  # estimates this much over what there is are refused
+
+# ---- seconds -------------------------------------------------------------------------------
+
+_ENTRY = 1e-6  # of a modal matrix, assembled; a level has (M + 1) n_s^2 blocks
+_FLOP = 2e-10  # of factors and of products with them
+_NEAR_PLAN = 2e-5  # a node of close bodies
+_NEAR_APPLY = 4e-6
+_SUM_APPLY = 4e-6  # a node, to three digits
+_START = 1.0
+_CLOSE = 0.1  # gap, in the smaller scale, from which on near corrections count
+
+
+@dataclass(frozen=True)
+class FlowEstimate:
+    """What solving would take; memory and seconds are those of the fullest of `ranks` ranks.
+
+    levels : curves and resolutions, for each of which matrices are made; share : memory a rank may
+    use [B]; file : size of the flow file [B]
+    """
+
+    bodies: int
+    nodes: int
+    levels: int
+    points: int
+    iterations: int
+    memory: int
+    seconds: float
+    file: int
+    ranks: int
+    share: int
+
+    @property
+    def contents(self) -> str:
+        """What the flow file holds."""
+        field = f", {self.points:,} points of the field" if self.points else ""
+        several = "bodies" if self.bodies > 1 else "body"
+        return f"{self.bodies:,} {several}, {self.nodes:,} nodes{field}"
+
+    def lines(self) -> list[str]:
+        """What there is to say, one fact a line."""
+        ranks = f"{self.ranks} ranks" if self.ranks > 1 else "1 rank"
+        kinds = f"{self.levels} resolution{'s' if self.levels > 1 else ''}"
+        return [
+            f"nodes    {self.nodes:,} on {self.bodies:,} surfaces of {kinds}, "
+            f"{3 * self.nodes:,} unknowns",
+            f"memory   about {readable_size(self.memory)} a rank on {ranks} (estimate)",
+            f"seconds  about {self.seconds:.2g}, {self.iterations} iterations (estimate)",
+            f"file     {readable_size(self.file)}",
+        ]
+
+    def refuse_what_does_not_fit(self) -> None:
+        """Raise InputError where a rank would need far more memory than its share."""
+        if self.memory > _DOUBT * self.share:
+            raise InputError(
+                f"{self.nodes:,} nodes would take about {readable_size(self.memory)} a rank, and "
+                f"this machine has {readable_size(self.share)}: take fewer bodies (--bodies, "
+                "--region), a looser --tolerance, a coarser --grid, or more machines"
+            )
+
+
+def estimate_flow(
+    parallel: Parallel, suspension: Suspension, options: FlowOptions, points: int, share: int
+) -> FlowEstimate:
+    """Collective. Estimate a solution of a suspension that has not been solved.
+
+    points : of the field, on all ranks; share : memory that a rank may use [B]
+    """
+    from stokes.flow_file import flow_bytes
+
+    report = suspension.report
+    n, b = parallel.max(np.array([suspension.offsets[-1], len(suspension.bodies)])).tolist()
+    own_points = -(-points // parallel.size)
+    layers = 2 if options.formulation == "combined" else 1
+    digits = -math.log10(report.tolerances.residual)
+    iterations = _iterations(report.least_gap, digits, report.bodies)
+    close = report.least_gap < _CLOSE
+    sizes = np.array(
+        [(3 * level.resolution.panels * level.resolution.nodes, level.resolution.modes + 1)
+         for level in report.levels]
+    )  # fmt: skip
+    entries = float((sizes[:, 0] ** 2 * sizes[:, 1]).sum())
+    basis = min(iterations, suspension.options.restart) + _VECTORS
+    memory = (
+        _BASE
+        + 8 * _MATRICES[options.formulation] * entries
+        + 8 * 3 * n * basis
+        + n * (_SUM_NODE[options.formulation] + close * _NEAR_NODE)
+        + _FIELD_POINT * own_points
+    )
+    per_body = entries * b / len(report.levels)  # of the mean level
+    seconds = (
+        _START
+        + _ENTRY * layers * entries / 9.0
+        + _FLOP * float((2.0 / 3.0 * sizes[:, 0] ** 3 * sizes[:, 1]).sum())
+        + close * _NEAR_PLAN * layers * n
+        + iterations
+        * (layers * n * (_SUM_APPLY * digits / 3.0 + close * _NEAR_APPLY) + 4.0 * _FLOP * per_body)
+        + 2.0 * own_points * _SUM_APPLY * digits / 3.0 * layers
+    )
+    return FlowEstimate(
+        bodies=report.bodies,
+        nodes=report.nodes,
+        levels=len(report.levels),
+        points=points,
+        iterations=iterations,
+        memory=round(memory),
+        seconds=seconds,
+        file=flow_bytes(report.bodies, report.nodes, points),
+        ranks=parallel.size,
+        share=share,
+    )
+
+
+def _iterations(gap: float, digits: float, bodies: int) -> int:
+    """More where bodies are close; one body alone is inverted exactly."""
+    if bodies == 1:
+        return 1
+    near = max(0.0, -math.log10(max(gap, 1e-3)))
+    return math.ceil(digits * (1.0 + near))
