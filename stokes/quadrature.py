@@ -10,7 +10,7 @@ panel's nodes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,7 +94,7 @@ def self_rule(
     target = rule.target
     difference = np.column_stack(meridian.curve.differences(s[target], rule.s))
     offsets = np.column_stack(meridian.curve.normal_offsets(s[target], rule.s))
-    return _completed(rule, difference, offsets)
+    return replace(rule, difference=difference, offsets=offsets)
 
 
 def near_rule(
@@ -107,14 +107,15 @@ def near_rule(
     """Return the rules for targets (r, z) : (n,), off the curve.
 
     pairs : (m, 2) targets and panels, sorted, to be given a rule in any case; by default those
-    panels that their own rule misses by more than `tolerance`.
+    panels that their own rule misses by more than `tolerance`. It is met for logarithmic
+    singularities; kernels as strong as stresses of the double layer err up to 100 times as much.
     """
     r, z = np.asarray(r, float), np.asarray(z, float)
     parts = _divided(meridian, r, z, np.full(r.shape, np.nan), pairs, tolerance)
     rule = _assembled(meridian, *parts)
     target = rule.target
     difference = np.column_stack([r[target] - rule.points[:, 0], z[target] - rule.points[:, 1]])
-    return _completed(rule, difference, None)
+    return replace(rule, difference=difference)
 
 
 def _divided(
@@ -159,7 +160,7 @@ def _assembled(
     end: Array,
     kind: NDArray[np.int64],
 ) -> PanelRule:
-    """Lay the rule of each piece on it."""
+    """Lay the rule of each piece on it; differences are left to the caller."""
     gauss, logarithmic = gauss_legendre(_PIECE_NODES), log_rule()
     sizes = np.where(kind == PLAIN, _PIECE_NODES, len(logarithmic[0]))
     first = np.concatenate([[0], np.cumsum(sizes)])
@@ -184,19 +185,6 @@ def _assembled(
         weights * points.speed,
         interpolation_matrix(meridian.resolution.nodes, local),
         np.column_stack([points.r, points.z, points.normal_r, points.normal_z]),
-        np.empty((0, 2)),
-        None,
-    )
-
-
-def _completed(rule: PanelRule, difference: Array, offsets: Array | None) -> PanelRule:
-    return PanelRule(
-        rule.pairs,
-        rule.starts,
-        rule.s,
-        rule.weights,
-        rule.interpolation,
-        rule.points,
-        difference,
-        offsets,
+        difference=np.empty((0, 2)),
+        offsets=None,
     )

@@ -79,8 +79,9 @@ class Resolution:
 class ResolutionLadder:
     """The resolutions from which bodies of one shape choose, coarse to fine.
 
-    tolerance : relative error wanted of densities. Level j serves neighbours at the gaps of
-    `gaps[j]`, in parts of the bounding radius: at a pole, anywhere else.
+    tolerance : relative error wanted of velocities; densities may err more next to neighbours.
+    Level j serves neighbours at the gaps of `gaps[j]`, in parts of the bounding radius: at a
+    pole, anywhere else.
     """
 
     curve: Curve
