@@ -93,7 +93,9 @@ def table_task(count: int, aim: str) -> dict[str, Any]:
     """S. De's experiment with so many bodies: at his resolution, or to a tolerance of 1e-8."""
     task = {"kind": "solve", "scene": _spheroids(count), "data": "point_forces"}
     if aim == "his":
-        return task | {"tolerance": 1e-6, "formulation": "single", "resolution": DE_RESOLUTION}
+        parts = {"fmm_tolerance": 1e-6, "residual_tolerance": 1e-6}
+        return task | {"tolerance": 1e-6, "formulation": "single", "resolution": DE_RESOLUTION,
+                       "options": parts}  # fmt: skip
     return task | {"tolerance": 1e-8, "formulation": "combined"}
 
 
@@ -104,7 +106,8 @@ def _table_pieces(quick: bool) -> Iterable[Piece]:
             counts = [2, 8, 64] if aim == "his" else [2, 8]
         for count in counts:
             for ranks in (1,) if quick else (1, 2):
-                task = table_task(count, aim)
+                runs = 3 if count <= (64 if aim == "his" else 16) else 1
+                task = table_task(count, aim) | {"runs": runs}
                 yield Piece("table", f"{aim}-{count}", task, ranks, 3600.0)
 
 
@@ -264,6 +267,9 @@ def _table_pair(aim: str, piece: Piece, row: dict[str, Any]) -> Iterable[Record]
     kept = ("bodies", "nodes", "gap", "volume_fraction", "converged", "residual", "phases",
             "error_absolute", "error_to_largest", "error_of_forces", "memory")  # fmt: skip
     params = {k: row[k] for k in kept}
+    # His measure at his resolution; for a tolerance the harder one, up to the surfaces.
+    at_his = row["error_absolute"].get("box")
+    error = at_his if aim == "his" else max(row["error_to_largest"].values())
     prefix = "stokes" if aim == "his" else f"stokes.to_{aim}"
     values = ((row["iterations"], his and his.applications), (whole(row), his and his.seconds))
     for (name, unit), (ours, theirs) in zip(
@@ -272,8 +278,7 @@ def _table_pair(aim: str, piece: Piece, row: dict[str, Any]) -> Iterable[Record]
         rival = {"rival": "S. De 2021, Table 3.1", "rival_value": theirs,
                  "ratio": ours / theirs} if theirs else {}  # fmt: skip
         yield Record(f"{prefix}.{name}.nb{row['bodies']}", params, ours, unit,
-                     error=max(row["error_to_largest"].values()), ranks=piece.ranks,
-                     **rival)  # fmt: skip
+                     error=error, runs=row["runs"], ranks=piece.ranks, **rival)  # fmt: skip
 
 
 def _gap_records(known: Known) -> Iterable[Record]:

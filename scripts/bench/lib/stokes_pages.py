@@ -148,7 +148,7 @@ def _de_table(known: Known, aim: str) -> str:
         if not piece.label.startswith(aim):
             continue
         phases = row["phases"]
-        seconds = [phases.get("kernels"), phases.get("factorisation"),
+        seconds = [_sum(phases, ("kernels", "factorisation")),
                    _sum(phases, ("near plan", "near", "self")), _sum(phases, ("fmm plan", "fmm")),
                    phases.get("preconditioner")]  # fmt: skip
         whole = row["seconds"]["set-up"] + row["seconds"]["solve"]
@@ -160,7 +160,7 @@ def _de_table(known: Known, aim: str) -> str:
             _number(max(row["error_to_largest"].values())),
         ])  # fmt: skip
     heads = ["bodies", "ranks", "nodes", "least gap", "volume fraction", "applications",
-             "kernels [s]", "factorisation [s]", "near [s]", "FMM [s]", "preconditioner [s]",
+             "kernels, factors [s]", "near, self [s]", "FMM [s]", "preconditioner [s]",
              "all [s]", "error in the box", "relative, to 10⁻³ of surfaces"]  # fmt: skip
     return _markdown(heads, rows)
 
