@@ -33,10 +33,12 @@ from stokes.krylov import KrylovResult, gmres
 from stokes.near import Layers, reach
 from stokes.preconditioner import BodyPreconditioner, Preconditioner
 from stokes.sources import UnitShape
+from stokes.suspension_estimate import estimate
 from stokes.suspension_layout import Field, Layout
 from stokes.suspension_operator import Ghosts, Members, PhaseClock, SuspensionOperator
 from stokes.suspension_options import (
-    Formulation,
+    FormulationName,
+    SuspensionEstimate,
     SuspensionOptions,
     SuspensionReport,
     Tolerances,
@@ -63,7 +65,7 @@ class Suspension:
         viscosity: float = 1.0,
         background: BackgroundFlow | None = None,
         tolerance: float = 1e-6,
-        formulation: Formulation = "single",
+        formulation: FormulationName = "single",
         parallel: Parallel | None = None,
         options: SuspensionOptions | None = None,
     ) -> None:
@@ -174,6 +176,10 @@ class Suspension:
             near_pairs=0 if operator is None else operator.near.report.pairs,
             fmm=sums[0][1].report if sums else None,
         )
+
+    def estimate(self) -> SuspensionEstimate:
+        """Collective. Nodes, bytes and operations of a solution, without its work."""
+        return estimate(self._scene, self.formulation, self.tolerances, self.options, self.parallel)
 
     # ---- solutions ---------------------------------------------------------------------------
 
@@ -307,6 +313,7 @@ class Suspension:
         """Collective. Make operators, plans and preconditioner, once."""
         if self._operator is not None:
             return
+        self._refuse_too_large()
         for group in self._surfaces.layout.groups:
             shape = self._scene.shapes[group.shape]
             with self._clock.phase("kernels"):
@@ -327,6 +334,18 @@ class Suspension:
             self._clock,
             self.parallel,
         )
+
+    def _refuse_too_large(self) -> None:
+        allowed = self.options.memory
+        if allowed is None:
+            return
+        found = self.estimate()
+        if found.bytes > allowed:
+            raise ValueError(
+                f"{found.bodies} bodies with {found.nodes} nodes would take {found.bytes / 1e9:.3g}"
+                f" GB on a rank, {allowed / 1e9:.3g} GB are allowed: take a larger tolerance, "
+                "fewer bodies or more ranks"
+            )
 
     def _preconditioner(self, free: bool) -> Preconditioner:
         """Collective. The one for given loads (`free`) or given motions, made once."""

@@ -11,7 +11,7 @@ from typing import Literal, get_args
 from stokes.fmm import FmmOptions, FmmReport
 from stokes.resolution import Resolution
 
-Formulation = Literal["single", "combined"]
+FormulationName = Literal["single", "combined"]
 PreconditionerName = Literal["body", "neighbours"]
 
 # Parts of the tolerance that each source of error is given. The residual's is the largest, as only
@@ -158,6 +158,7 @@ class SuspensionEstimate:
 
     nodes          : of all ranks; unknowns three times as many
     levels         : curves and resolutions
+    tolerances     : what they and the sums are made for
     matrix_bytes   : of the operators of shapes, on the rank that has most
     vector_bytes   : of GMRES's vectors, on the rank that has most
     near_bytes     : of the near corrections, roughly, on the rank that has most
@@ -168,6 +169,7 @@ class SuspensionEstimate:
     bodies: int
     nodes: int
     levels: tuple[Level, ...]
+    tolerances: Tolerances
     matrix_bytes: int
     vector_bytes: int
     near_bytes: int

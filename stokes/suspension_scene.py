@@ -24,6 +24,7 @@ from stokes.suspension_table import BodyTable, quaternions_to
 
 # Gap, over the larger scale, from which on a neighbour changes neither axes nor resolutions.
 _REACH = 2.0
+_CLOSE = 0.1  # gap of pairs whose near field takes memory
 
 
 @dataclass(frozen=True)
@@ -33,12 +34,14 @@ class Scene:
     table     : of all bodies; shapes: distinct curves and resolutions, the same on all ranks
     shape     : (B,) number of each body's
     least_gap : of all ranks; inf without neighbours
+    close_pairs : (k, 2) of a body of this rank and another at a gap below the smaller scale's tenth
     """
 
     table: BodyTable
     shapes: tuple[UnitShape, ...]
     shape: NDArray
     least_gap: float
+    close_pairs: NDArray
 
     @classmethod
     def survey(
@@ -69,6 +72,7 @@ class Scene:
             shapes=shapes,
             shape=np.array([number[shape] for shape in every], dtype=np.int64),
             least_gap=parallel.min(float(close.relative.min(initial=np.inf))),
+            close_pairs=close.pair[close.relative < _CLOSE],
         )
 
     @property
