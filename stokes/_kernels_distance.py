@@ -71,18 +71,14 @@ def nearest(edges, series, samples, r, z):
     could still become the least distance is refined.
     """
     n = samples.shape[1]
-    least = np.inf
-    for j in range(n):
-        least = min(least, np.hypot(samples[1, j] - r, samples[2, j] - z))
     best, best_s, best_delta = np.inf, 0.0, 0.0
-    before = np.inf
-    here = np.hypot(samples[1, 0] - r, samples[2, 0] - z)
+    before, here = np.inf, _squared(samples, 0, r, z)
     for j in range(n):
         low, high = max(j - 1, 0), min(j + 1, n - 1)
-        after = np.hypot(samples[1, high] - r, samples[2, high] - z) if high > j else np.inf
+        after = _squared(samples, high, r, z) if high > j else np.inf
         if here <= before and here <= after:
             step = np.hypot(samples[1, high] - samples[1, low], samples[2, high] - samples[2, low])
-            if here <= least + step:
+            if np.sqrt(here) <= best + step:
                 s = _foot_between(
                     edges, series, samples[0, low], samples[0, high], samples[0, j], r, z
                 )
@@ -94,6 +90,11 @@ def nearest(edges, series, samples, r, z):
                     best_delta = ((gr - r) * dz + (z - gz) * dr) / np.hypot(dr, dz)
         before, here = here, after
     return best_delta, best_s
+
+
+@jit
+def _squared(samples, j, r, z):
+    return (samples[1, j] - r) ** 2 + (samples[2, j] - z) ** 2
 
 
 @jit
@@ -245,11 +246,13 @@ def _least_distance(table_a, body_a, table_b, body_b):
                     lowest = min(lowest, grid[j, m % _AZIMUTHS])
             if grid[i, k] <= lowest:
                 starts[i, k] = grid[i, k]
+    # No point of A is farther than this from the grid, nor its distance lower by more.
+    cell = scale_a * (_widest_ring(samples_a) + np.pi / _AZIMUTHS * samples_a[1].max())
     best = (np.inf, 0.0, 0.0, centre_a, centre_b)
     for _ in range(_STARTS):
         flat = np.argmin(starts)
         i, k = flat // _AZIMUTHS, flat % _AZIMUTHS
-        if starts[i, k] == np.inf:
+        if starts[i, k] == np.inf or starts[i, k] > best[0] + cell:
             break
         starts[i, k] = np.inf
         phi = first + 2.0 * np.pi * k / _AZIMUTHS
@@ -258,6 +261,19 @@ def _least_distance(table_a, body_a, table_b, body_b):
         if found[0] < best[0]:
             best = found
     return best
+
+
+@jit
+def _widest_ring(samples):
+    """Greatest distance along the meridian of a point from the nearest of the grid's rings."""
+    n = samples.shape[1]
+    widest = 0.0
+    for i in range(_RINGS - 1):
+        length = 0.0
+        for j in range(i * (n - 1) // (_RINGS - 1), (i + 1) * (n - 1) // (_RINGS - 1)):
+            length += np.hypot(samples[1, j + 1] - samples[1, j], samples[2, j + 1] - samples[2, j])
+        widest = max(widest, length)
+    return 0.5 * widest
 
 
 @jit
