@@ -34,7 +34,7 @@ from stokes.near import Layers, reach
 from stokes.preconditioner import BodyPreconditioner, Preconditioner
 from stokes.sources import UnitShape
 from stokes.suspension_estimate import estimate
-from stokes.suspension_layout import Field, Layout
+from stokes.suspension_layout import Field, Layout, Packing
 from stokes.suspension_operator import Ghosts, Members, PhaseClock, SuspensionOperator
 from stokes.suspension_options import (
     FormulationName,
@@ -232,40 +232,29 @@ class Suspension:
 
     def _iterate(self, right_side: Field) -> tuple[KrylovResult, Field]:
         """Solve, residuals in the norm of L2 over all surfaces; loads count as velocities."""
-        nodal = np.sqrt(self._surfaces.weights)[:, None]
-        rigid = np.sqrt(self._surfaces.area)[:, None] / _DRAG
-        n = 3 * self._surfaces.layout.nodes
-        freely = right_side.rigid is not None
-        preconditioner = self._preconditioner(freely)
+        free = right_side.rigid is not None
+        pack = Packing(
+            velocity_weight=np.sqrt(self._surfaces.weights)[:, None],
+            load_weight=np.sqrt(self._surfaces.area)[:, None] / _DRAG,
+            free=free,
+        )
+        operator, preconditioner = self._operator, self._preconditioner(free)
 
-        def flat(field: Field, weighted: bool) -> NDArray:
-            parts = [field.nodal * nodal if weighted else field.nodal]
-            if freely:
-                parts.append(field.rigid * rigid if weighted else field.rigid)
-            return np.concatenate([part.ravel() for part in parts])
-
-        def field(vector: NDArray, weighted: bool) -> Field:
-            values = vector[:n].reshape(-1, 3)
-            loads = vector[n:].reshape(-1, 6) if freely else None
-            if not weighted:
-                return Field(values, loads)
-            return Field(values / nodal, loads / rigid if freely else None)
-
-        def correction(residual: NDArray) -> NDArray:
+        def corrected(residual: NDArray) -> NDArray:
             with self._clock.phase("preconditioner"):
-                return flat(preconditioner.apply(field(residual, True)), False)
+                return pack.unknown_vector(preconditioner.apply(pack.residual(residual)))
 
         result = gmres(
-            operator=lambda x: flat(self._operator.apply(field(x, False)), True),
-            preconditioner=correction,
-            right_hand_side=flat(right_side, True),
+            operator=lambda x: pack.residual_vector(operator.apply(pack.unknown(x))),
+            preconditioner=corrected,
+            right_hand_side=pack.residual_vector(right_side),
             tolerance=self.tolerances.residual,
             max_iterations=self.options.max_iterations,
             restart=self.options.restart,
             flexible=preconditioner.flexible,
             parallel=self.parallel,
         )
-        return result, field(result.unknown, False)
+        return result, pack.unknown(result.unknown)
 
     def _answer(
         self, request: Request, problem: Problem, unknown: Field, result: KrylovResult

@@ -117,3 +117,41 @@ class Layout:
     def range_of(self, row: int) -> NDArray:
         """Nodes of the body in this row, one after another."""
         return np.arange(self.offsets[row], self.offsets[row + 1])
+
+
+@dataclass(frozen=True)
+class Packing:
+    """Fields as the flat vectors of an iteration.
+
+    velocity_weight : (n, 1), load_weight : (b, 6) that residuals are multiplied by: their Euclidean
+                      norm is then the wanted one; unknowns stay as they are
+    free            : whether fields have a rigid part
+    """
+
+    velocity_weight: NDArray
+    load_weight: NDArray
+    free: bool
+
+    def residual_vector(self, residual: Field) -> NDArray:
+        """Weighted velocities and loads, one after another."""
+        parts = [self.velocity_weight * residual.nodal]
+        if self.free:
+            parts.append(self.load_weight * residual.rigid)
+        return np.concatenate([part.ravel() for part in parts])
+
+    def residual(self, vector: NDArray) -> Field:
+        """The residual of a vector, weights taken off."""
+        weighted = self.unknown(vector)
+        nodal = weighted.nodal / self.velocity_weight
+        return Field(nodal, weighted.rigid / self.load_weight if self.free else None)
+
+    def unknown_vector(self, unknown: Field) -> NDArray:
+        """Densities and motions, one after another."""
+        parts = [unknown.nodal, unknown.rigid] if self.free else [unknown.nodal]
+        return np.concatenate([part.ravel() for part in parts])
+
+    def unknown(self, vector: NDArray) -> Field:
+        """Views of the densities and motions in a vector."""
+        end = 3 * len(self.velocity_weight)
+        rigid = vector[end:].reshape(-1, 6) if self.free else None
+        return Field(vector[:end].reshape(-1, 3), rigid)

@@ -29,7 +29,7 @@ class SuspensionOptions:
     resolution     : of every body, in place of the one chosen from tolerance and neighbours
     turn_spheres   : lay the axis of a sphere's grid through its nearest neighbour, where few
                      azimuthal modes resolve what happens in the gap
-    least_gap      : smallest gap allowed, over the smaller of both bodies' scales
+    least_gap      : smallest gap allowed, over the smaller bounding radius of both bodies
     max_iterations : of GMRES; restart: iterations between restarts, each of which keeps a vector
     residual_tolerance, fmm_tolerance, near_tolerance, resolution_tolerance : the parts of the
                      tolerance given to GMRES, the fast sums, near corrections and the grids
@@ -105,7 +105,7 @@ class Tolerances:
     def for_gap(self, gap: float, options: SuspensionOptions) -> Tolerances:
         """The same with smaller ones for sums where densities are large and cancel.
 
-        gap : least gap, over the scale. Tractions in it grow like 1/gap^2 of the velocities, over
+        gap : least gap, over the radius. Tractions in it grow like 1/gap^2 of the velocities, over
         an area in proportion to it. Given tolerances are kept.
         """
         share = min(1.0, gap)
@@ -130,7 +130,7 @@ class SuspensionReport:
     """What a suspension is made of, of all ranks together unless said otherwise.
 
     levels       : curves and resolutions in use
-    least_gap    : between any two bodies, over the smaller scale; inf for a single body
+    least_gap    : between any two bodies, over the smaller bounding radius; inf without close ones
     applications : of the operator, so far
     seconds      : wall clock of this rank by phase, so far: "geometry", "kernels",
                    "factorisation", "near plan", "fmm plan", "fmm", "near", "self",

@@ -1,6 +1,7 @@
 """What a suspension is before any equation: gaps between bodies, and how finely each is resolved.
 
-Symbols: B bodies of all ranks, b of this one; gaps are over the smaller scale of both bodies.
+Symbols: B bodies of all ranks, b of this one. Relative gaps are over the smaller bounding radius of
+both bodies.
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ from stokes.sources import UnitShape
 from stokes.suspension_options import Level, SuspensionOptions
 from stokes.suspension_table import BodyTable, quaternions_to
 
-# Gap, over the larger scale, from which on a neighbour changes neither axes nor resolutions.
-_REACH = 2.0
+# Gap, over the sum of bounding radii, from which on a neighbour changes neither axes nor grids.
+_REACH = 1.0
 _CLOSE = 0.1  # gap of pairs whose near field takes memory
 
 
@@ -34,7 +35,7 @@ class Scene:
     table     : of all bodies; shapes: distinct curves and resolutions, the same on all ranks
     shape     : (B,) number of each body's
     least_gap : of all ranks; inf without neighbours
-    close_pairs : (k, 2) of a body of this rank and another at a gap below the smaller scale's tenth
+    close_pairs : (k, 2) of a body of this rank and another at a relative gap below a tenth
     """
 
     table: BodyTable
@@ -95,7 +96,7 @@ class Scene:
 class _ClosePairs:
     """Pairs (k, 2) of a body of this rank and another, in rising order, and where they are close.
 
-    gap (k,), relative (k,) over the smaller scale, point (k, 3) on the first body's surface
+    gap (k,), relative (k,), point (k, 3) on the first body's surface
     """
 
     pair: NDArray
@@ -106,7 +107,8 @@ class _ClosePairs:
     @classmethod
     def find(cls, table: BodyTable) -> _ClosePairs:
         """Pairs of this rank's bodies and all that are within reach of them."""
-        pair = table.pairs(table.bounding_radius + 0.5 * _REACH * table.scale)
+        radius = table.bounding_radius
+        pair = table.pairs((1.0 + _REACH) * radius)
         numbers, local = np.unique(pair, return_inverse=True)
         bodies = [table.body(k) for k in numbers.tolist()]
         ordered = np.sort(local.reshape(-1, 2), axis=1)
@@ -114,9 +116,8 @@ class _ClosePairs:
         found = gaps_of_pairs(bodies, once)
         where = where.reshape(-1)
         second = (local.reshape(-1, 2)[:, 0] != ordered[:, 0]).astype(np.int64)
-        scale = table.scale[pair].min(axis=1) if len(pair) else np.empty(0)
         gap = found.distance[where]
-        return cls(pair, gap, gap / scale, found.points[where, second])
+        return cls(pair, gap, gap / radius[pair].min(axis=1), found.points[where, second])
 
     def check(self, table: BodyTable, least: float) -> None:
         """ValueError that names the closest bodies, if they are closer than allowed."""
@@ -127,8 +128,8 @@ class _ClosePairs:
         what = "overlap" if self.gap[worst] < 0.0 else "are too close"
         raise ValueError(
             f"bodies {i} and {j}, at {_place(table, i)} and {_place(table, j)}, {what}: their gap "
-            f"is {self.gap[worst]:.3g}, {self.relative[worst]:.2g} of the smaller one's scale, and "
-            f"must be >= {least:g} of it"
+            f"is {self.gap[worst]:.3g}, {self.relative[worst]:.2g} of the smaller one's radius, "
+            f"and must be >= {least:g} of it"
         )
 
     def turned(self, table: BodyTable) -> NDArray:
@@ -162,8 +163,20 @@ class _ClosePairs:
             for k in np.flatnonzero(table.curve[table.own] == c).tolist():
                 near = slice(int(first[k]), int(last[k]))
                 gap = self.gap[near] / table.scale[table.own[k]]
-                shapes[k] = UnitShape(ladder.curve, ladder.resolution(gap, s[near]))
+                try:
+                    shapes[k] = UnitShape(ladder.curve, ladder.resolution(gap, s[near]))
+                except ValueError as fault:
+                    raise ValueError(self._named(table, int(table.own[k]), near, fault)) from None
         return [shapes[k] for k in range(len(table.own))]
+
+    def _named(self, table: BodyTable, body: int, near: slice, fault: ValueError) -> str:
+        """What no resolution suits, with the bodies it is about."""
+        closest = near.start + int(np.argmin(self.gap[near]))
+        other = int(self.pair[closest, 1])
+        return (
+            f"bodies {body} and {other}, at {_place(table, body)} and {_place(table, other)}, at a "
+            f"gap of {self.gap[closest]:.3g}: {fault}"
+        )
 
     def _parameters(self, table: BodyTable) -> NDArray:
         """Where on the curve of each pair's first body the nearest point lies, (k,)."""
