@@ -430,9 +430,9 @@ def flow(
     ] = False,
     threads: Annotated[int, typer.Option("--threads", min=1, help="Threads of a rank.")] = 1,
 ) -> None:
-    """Stokes flow around the bodies of a frame: mpirun -n P dem-mpi flow RUN.h5.
+    """Stokes flow around bodies: mpirun -n P dem-mpi flow RUN.h5.
 
-    Reads spheres, spheroids and rods, with their motions, and writes loads, motions, densities on
+    Reads spheres, spheroids and rods of a frame and writes loads, motions, densities on
     the surfaces and, if asked for, the flow on a grid into FLOW.h5, which ParaView opens. Ends with
     0 if the tolerance holds and with 70 if it does not; the file then says so. There is no
     checkpoint: a signal ends it at once, and leaves no file.

@@ -298,7 +298,7 @@ def _rows(points: ArrayLike) -> NDArray:
 
 
 def _numbers(values: Sequence[float]) -> str:
-    return ",".join(repr(float(value)) for value in values)
+    return ",".join(repr(float(value)).removesuffix(".0") for value in values)
 
 
 def _at(origin: Vector) -> str:

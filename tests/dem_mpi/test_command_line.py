@@ -50,7 +50,7 @@ def finished(tmp_path_factory) -> Path:
 # ---- help and usage ---------------------------------------------------------------------------
 
 VERBS = {
-    "": ("--version", "run", "check", "schema", "info", "solve", "warmup"),
+    "": ("--version", "run", "check", "schema", "info", "solve", "flow", "warmup"),
     "run": ("SCENE", "--resume", "--out DIR", "--set KEY.PATH=VALUE", "--force"),
     "check": ("SCENE", "--set KEY.PATH=VALUE", "--ranks"),
     "schema": (),
@@ -58,6 +58,12 @@ VERBS = {
     "solve": (
         "PROBLEM.h5", "--tolerance", "--tolerance-kind", "--complementarity", "--max-iterations",
         "--guess", "--out FILE.h5", "--force",
+    ),
+    "flow": (
+        "RUN.h5", "--frame last|N|TIME", "--bodies", "--region", "--hydrodynamic-radius",
+        "--viscosity", "--background", "--problem", "--gravity", "--fluid-density", "--tolerance",
+        "--formulation", "--max-iterations", "--grid NX,NY,NZ", "--points", "--output FLOW.h5",
+        "--force", "--render", "--slice", "--dry-run", "--threads",
     ),
     "warmup": ("--threads",),
 }  # fmt: skip
