@@ -112,11 +112,13 @@ def test_modes_fall_off_towards_the_axis_by_their_leading_power(p):
 @pytest.mark.parametrize("distance", DISTANCES)
 def test_sequences_are_positive_and_scale_with_length_to_the_last_bit(distance):
     d2, p = 2.0 * distance, 1.0
-    values = toroidal_table([d2, 4.0 * d2, d2 / 1024.0], [p, 4.0 * p, p / 1024.0], 40, 3)
+    squares = np.array([1.0, 4.0, 2.0**-10, 2.0**-80])  # next to a pole lengths may be tiny
+    values = toroidal_table(d2 * squares, p * squares, 40, 3)
     assert np.all(values > 0.0)
     powers = 2.0 * np.arange(4)[:, None] + 1.0
     assert np.array_equal(values[1], values[0] * 2.0**-powers)
     assert np.array_equal(values[2], values[0] * 32.0**powers)
+    assert np.array_equal(values[3], values[0] * 2.0 ** (40.0 * powers))
 
 
 @pytest.mark.parametrize("distance", DISTANCES)
