@@ -100,9 +100,11 @@ class Curve(ABC):
         edges = np.array(self.breaks)
         s = edges[:-1, None] + np.diff(edges)[:, None] * np.linspace(0, 1, 257)
         points = self.evaluate(s)
-        # Between samples the distance from the origin rises by no more than half a step.
-        step = (points.speed[:, :-1] * np.diff(s, axis=1)).max()
-        return float(np.hypot(np.hypot(points.r, points.z).max(), step))
+        # Between samples |gamma|^2 exceeds theirs by no more than (k |gamma| - 1)(step/2)^2.
+        squared = points.r**2 + points.z**2
+        step = points.speed * np.diff(edges)[:, None] / 256
+        bulge = np.maximum(points.meridional_curvature, 0) * np.sqrt(squared) * (0.5 * step) ** 2
+        return float(np.sqrt((squared + bulge).max()))
 
     @cached_property
     def polynomials(self) -> tuple[Array, Array]:
