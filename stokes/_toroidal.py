@@ -18,8 +18,8 @@ from dem_mpi._jit import jit
 
 HIGHEST_ORDER = 3
 
-# The downward recurrence starts from this value; it grows by e^(n xi), and neither that may overflow
-# nor the ratio to it of G^m_0, some d^(-2m-1) of lengths d that may be tiny.
+# The downward recurrence starts from this value and grows by e^(n xi). Neither may that overflow
+# nor the ratio of G^m_0 to it, which goes like d^(-2m-1) for lengths d that may be tiny.
 _SMALLEST = 1e-200
 _LARGEST_GROWTH = 600.0
 # An error in the ratio assumed at the start decays by e^(-2 xi) a step: e^-40 is left of it.
