@@ -17,9 +17,11 @@ class Preconditioner(Protocol):
     What a residual and an unknown are, and in which frames and units, `suspension_layout` says.
 
     flexible : whether it changes a little from call to call, as one that iterates itself does
+    nbytes   : of what it holds beside the shapes' operators, on this rank
     """
 
     flexible: bool
+    nbytes: int
 
     def apply(self, residual: Field) -> Field:
         """Collective. Approximate unknowns of a residual; `rigid` is None if it is given as None.
@@ -33,6 +35,7 @@ class BodyPreconditioner:
     """The exact inverse of every body alone in the fluid."""
 
     flexible = False
+    nbytes = 0
 
     def __init__(self, layout: Layout, solvers: Mapping[int, ShapeSolver]) -> None:
         """Take the bodies of this rank and the solver of each of their shapes."""

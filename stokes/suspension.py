@@ -93,7 +93,7 @@ class Suspension:
             )
             self._surfaces = self._own_surfaces()
         self.tolerances = self.tolerances.for_gap(self._scene.least_gap, self.options)
-        self._cache = OperatorCache()
+        self._cache = OperatorCache(self.options.threads)
         self._solvers: dict[int, ShapeSolver] = {}
         self._operator: SuspensionOperator | None = None
         self._preconditioners: dict[bool, Preconditioner] = {}
@@ -164,6 +164,7 @@ class Suspension:
         if operator is not None:
             memory["near"] = operator.near.report.bytes
             memory["fmm"] = sum(sum(plan.report.memory.values()) for _, plan in sums)
+            memory["preconditioner"] = sum(p.nbytes for p in self._preconditioners.values())
         return SuspensionReport(
             bodies=scene.table.count,
             nodes=int(scene.nodes.sum()),
@@ -276,7 +277,7 @@ class Suspension:
             self.background,
             self.viscosity,
             min(self.tolerances.near, self.tolerances.fmm),
-            self.options.fmm,
+            self.options,
             self.parallel,
         )
         return SuspensionSolution(
@@ -303,14 +304,8 @@ class Suspension:
         if self._operator is not None:
             return
         self._refuse_too_large()
-        for group in self._surfaces.layout.groups:
-            shape = self._scene.shapes[group.shape]
-            with self._clock.phase("kernels"):
-                solver = self._cache.solver(shape.curve, shape.resolution, self.formulation)
-            with self._clock.phase("factorisation"):
-                _ = solver.resistance
-            self._solvers[group.shape] = solver
-        self._cache.release_operators()
+        with raised_together(self.parallel):
+            self._factorise()
         members, needed = self._members()
         ghosts = Ghosts(self._surfaces.layout, needed, self.parallel)
         self._operator = SuspensionOperator(
@@ -323,6 +318,16 @@ class Suspension:
             self._clock,
             self.parallel,
         )
+
+    def _factorise(self) -> None:
+        for group in self._surfaces.layout.groups:
+            shape = self._scene.shapes[group.shape]
+            with self._clock.phase("kernels"):
+                solver = self._cache.solver(shape.curve, shape.resolution, self.formulation)
+            with self._clock.phase("factorisation"):
+                _ = solver.resistance  # the first solution factorises
+            self._solvers[group.shape] = solver
+        self._cache.release_operators()
 
     def _refuse_too_large(self) -> None:
         allowed = self.options.memory

@@ -102,11 +102,12 @@ class Ghosts:
         return values
 
 
-def sum_options(options: FmmOptions, tolerance: float) -> FmmOptions:
-    """These options, of direct sums where no fast one reaches the tolerance."""
-    if tolerance >= _LEAST_FAST or options.order is not None or options.backend != "own":
-        return options
-    return replace(options, backend="direct")
+def sum_options(options: SuspensionOptions, tolerance: float) -> FmmOptions:
+    """Options of sums: with this rank's threads, direct where no fast one reaches the tolerance."""
+    fmm = replace(options.fmm, threads=max(options.fmm.threads, options.threads))
+    if tolerance >= _LEAST_FAST or fmm.order is not None or fmm.backend != "own":
+        return fmm
+    return replace(fmm, backend="direct")
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ class SuspensionOperator:
                 self._layout.body_of_node,
                 options.threads,
             )
-        fmm = sum_options(options.fmm, tolerances.fmm)
+        fmm = sum_options(options, tolerances.fmm)
         with clock.phase("fmm plan"):
             self.sums = tuple(
                 (weights, Fmm(kernel, points, None, tolerances.fmm, fmm, parallel))

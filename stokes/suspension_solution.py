@@ -11,12 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from dem_mpi.parallel import Parallel
 from stokes.background import BackgroundFlow
 from stokes.evaluate import evaluate
-from stokes.fmm import FmmOptions
 from stokes.formulation import ShapeSolver
 from stokes.geometry import Body, Resolution
 from stokes.near import Quantity
 from stokes.suspension_operator import sum_options
-from stokes.suspension_options import SuspensionReport
+from stokes.suspension_options import SuspensionOptions, SuspensionReport
 from stokes.suspension_surfaces import OwnSurfaces
 
 
@@ -35,7 +34,7 @@ class DisturbedFlow:
     background: BackgroundFlow | None
     viscosity: float
     tolerance: float
-    fmm: FmmOptions
+    options: SuspensionOptions
     parallel: Parallel
 
     def velocity(self, points: ArrayLike) -> NDArray:
@@ -63,7 +62,7 @@ class DisturbedFlow:
             self.viscosity,
             self.tolerance,
             self.parallel,
-            sum_options(self.fmm, self.tolerance),
+            sum_options(self.options, self.tolerance),
         )
 
 

@@ -416,7 +416,7 @@ def test_report_says_what_was_made_and_what_it_took():
     assert report.applications == found.iterations
     phases = {"geometry", "kernels", "factorisation", "near plan", "fmm plan", "fmm", "near"}
     assert phases | {"self", "preconditioner", "krylov"} <= set(report.seconds)
-    assert set(report.memory) == {"operators", "near", "fmm"}
+    assert set(report.memory) == {"operators", "near", "fmm", "preconditioner"}
     assert report.least_gap == pytest.approx(0.5)
     assert found.residuals[0] == 1.0
     assert found.residuals[-1] <= report.tolerances.residual
