@@ -144,6 +144,10 @@ class ModalOperators:
                 ),
                 matrices,
             )
+        if not np.isfinite(matrices).all():
+            raise FloatingPointError(
+                f"layer {layer} of {self.curve} with {self.resolution}: values that are not finite"
+            )
         return matrices
 
     @cached_property
