@@ -158,12 +158,14 @@ def schema() -> None:
 
 @app.command(epilog=_EPILOG)
 def info(
-    file: Annotated[Path, typer.Argument(help="Trajectory or checkpoint.", metavar="FILE.h5")],
+    file: Annotated[
+        Path, typer.Argument(help="Trajectory, checkpoint or flow.", metavar="FILE.h5")
+    ],
 ) -> None:
     """Say what is in a file of a run, and whether it is valid.
 
-    FILE.h5 is a trajectory or a checkpoint; of anything else it says that (65). A run that is
-    going on may be looked at, too.
+    FILE.h5 is a trajectory, a checkpoint or a flow; of anything else it says that (65). A run that
+    is going on may be looked at, too.
     """
     from dem_mpi.output import describe
 

@@ -41,13 +41,15 @@ from dem_mpi.trajectory import (
     root_attributes,
 )
 
+_FLOW = "stokes flow"  # the format that `stokes.flow_file` writes
+
 
 @dataclass(frozen=True)
 class Description:
     """What a file holds, for people: `exit_code` is 0 if it is valid and 65 if it is not."""
 
     path: Path
-    kind: str  # "trajectory", "checkpoint" or "unknown"
+    kind: str  # "trajectory", "checkpoint", "flow" or "unknown"
     valid: bool
     reason: str  # why it is not valid, "" if it is
     size: int  # [B]
@@ -63,6 +65,7 @@ class Description:
     version: str = ""
     scene: str = ""
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()  # of a flow
 
     @property
     def exit_code(self) -> int:
@@ -75,8 +78,8 @@ class Description:
         lines = [f"{self.path}: {self.kind}, {readable_size(self.size)}, {verdict}"]
         if self.writer:
             lines.append(f"  being written by {self.writer}")
-        if self.kind == "unknown" or not (self.frames or self.fields):
-            return lines
+        if self.kind in ("flow", "unknown") or not (self.frames or self.fields):
+            return lines + [f"  {note}" for note in self.notes]
         if self.scene or self.version:
             lines.append(f"  scene {self.scene or '(no name)'}, by dem-mpi {self.version}")
         fewest, most = self.bodies
@@ -111,8 +114,12 @@ def describe(path: Path | str, *, verify: bool = True) -> Description:
             if kind == FORMAT:
                 found = replace(found, kind="trajectory")
                 return _describe_trajectory(path, file, found, verify)
+            if kind == _FLOW:
+                return _describe_flow(path, replace(found, kind="flow"))
             if kind != checkpoint.FORMAT:
-                raise DataError(f"{path}: neither a trajectory nor a checkpoint of dem-mpi")
+                raise DataError(
+                    f"{path}: neither a trajectory nor a checkpoint nor a flow of dem-mpi"
+                )
         found = replace(found, kind="checkpoint")
         return _describe_checkpoint(path, found)
     except DataError as error:
@@ -219,6 +226,29 @@ def _describe_checkpoint(path: Path, found: Description) -> Description:
         scene=_scene_name(attributes),
         attributes=attributes,
     )
+
+
+def _describe_flow(path: Path, found: Description) -> Description:
+    """What is in a file of `dem-mpi flow`, all of it read, for its data sets check themselves."""
+    from stokes.flow_file import read_flow
+
+    try:
+        flow = read_flow(path)
+    except ValueError as error:
+        return replace(found, reason=str(error).removeprefix(f"{path}: "))
+    get = flow.attributes.get
+    points = 0 if flow.field is None else len(flow.field.velocity)
+    solved = "converged" if get("converged") else f"NOT CONVERGED, {get('reason', '')}"
+    notes = [f"{len(flow.bodies['position']):,} bodies, {len(flow.surfaces.position):,} nodes"]
+    notes[0] += f", {points:,} points of the field" if points else ""
+    if "source" in flow.attributes:
+        notes.append(f"of {get('source')}, frame {get('frame')}, t = {get('time'):.6g} s")
+    if "problem" in flow.attributes:
+        notes.append(
+            f"{get('problem')}, {solved}: {get('iterations')} iterations, residual "
+            f"{get('residual'):.2e}, tolerance {get('tolerance'):g}"
+        )
+    return replace(found, valid=True, complete=True, notes=tuple(notes), attributes=flow.attributes)
 
 
 def _scene_name(attributes: Mapping[str, Any]) -> str:

@@ -1,7 +1,7 @@
 """From a trajectory to the later stages: the bodies of a frame, as `stokes` takes them.
 
-The only module that knows both sides; `stokes` is imported when its bodies are asked for. What a
-scene has besides bodies, walls and periodic copies, is not handed over.
+The only place where rows of a trajectory become bodies of a fluid; `stokes` is imported when these
+are asked for. What a scene has besides bodies, walls and periodic copies, is not handed over.
 
 Bodies that touch have no boundary-integral solution: the film between them would be of no
 thickness. They are handed over smaller, all by one factor, each about its own centre.

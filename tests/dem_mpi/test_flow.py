@@ -449,3 +449,21 @@ def test_every_flag_is_on_the_page_and_no_other():
     )  # fmt: skip
     flags = set(re.findall(r"--[a-z][a-z-]+", done.stdout.split("Exit codes")[0])) - {"--help"}
     assert set(re.findall(r"--[a-z][a-z-]+", PAGE)) == flags
+
+
+def test_info_says_what_is_in_a_flow_file(pile, tmp_path):
+    from dem_mpi.output import describe
+
+    out = tmp_path / "flow.h5"
+    flow_of(pile, out=out, grid="2,2,2", tolerance=1e-2)
+    found = describe(out)
+    assert (found.kind, found.valid, found.exit_code) == ("flow", True, 0)
+    words = " ".join(found.lines())
+    for expected in ("3 bodies", "8 points of the field", str(pile), "resistance, converged"):
+        assert expected in words
+    with h5py.File(out, "r+") as file:
+        place = file["bodies/force"].id.get_chunk_info(0).byte_offset
+    with out.open("r+b") as file:
+        file.seek(place + 20)
+        file.write(b"\xff\xff")
+    assert (describe(out).valid, describe(out).exit_code) == (False, 65)
