@@ -134,9 +134,7 @@ class Partner:
 
         Gap and curvature are rounded to powers of two, so that few grids serve all pairs.
         """
-        edges = self._graded(
-            2.0 ** math.floor(math.log2(gap)), 2.0 ** math.floor(math.log2(curvature))
-        )
+        edges = self._graded(*(2.0 ** math.floor(math.log2(x)) for x in (gap, curvature)))
         if not self.at_north:
             edges = [1.0 - s for s in reversed(edges)]
         return PolarGrid(Resolution(tuple(edges), options.nodes, options.modes), self.sign)
@@ -324,9 +322,7 @@ class PairFactory:
     def _coupling(self, target: _Side, source: _Side) -> Array:
         """N: from densities of `source` to velocities on `target`, (M + 1, 3 N_t, 3 N_s)."""
         solver = self._solver(source.curve, source.grid)
-        single, double = (
-            None if layer is None else float(layer) for layer in solver.layers(np.ones(()))
-        )
+        single, double = solver.coefficients
         x, y = target.points(source), source.points(source)
         n_t, n_s = len(x), len(y)
         pairs = np.repeat(x, n_s, axis=0), np.tile(y, (n_t, 1))

@@ -1,41 +1,44 @@
 """A preconditioner that knows what close bodies do to one another.
 
 A density q of all bodies solves D_i q_i + sum over j of N_ij q_j = r_i, D_i the operator of body i
-alone. With x = D^-1 r, which the one-body preconditioner gives, the close pairs c of bodies (i, j)
-are kept of the sum, each as its exact two-body solution on polar grids about its line
-(`stokes.pairs`). R_ic restricts a density of body i to the grid of pair c, L_ic is the way back:
+alone. To the answer x = D^-1 r of every body alone, each close pair c of bodies (i, j) adds what
+its exact two-body solution differs by (`stokes.pairs`): with R_ic, which restricts a density of
+body i to the polar grid of pair c, and the way back L_ic,
 
-    psi_c = P_c t_c,   t_ic = R_ic x_i - sum over c' != c of R_ic L_ic' psi_ic',   q = x - L psi.
+    q = x - sum over c of L_c P_c R_c x,
 
-The second equation is a Schwarz method over overlapping pairs, solved for all of them at once:
-(1 + P T) psi = P R x with T = R L between pairs that share a body. It has a few hundred unknowns
-for a body and is solved by some iterations, which cost no sum over surface nodes; so the
-preconditioner changes a little from call to call, and the outer iteration must be flexible.
+an additive Schwarz method with pairs as subdomains, whose overlap, single bodies, is counted once.
+A density of one body and what it makes on that body's partners is reproduced exactly but for what
+it makes on third bodies. There it is a smooth flow, which the gaps between those answer as mildly
+as they should. (To solve for all pairs together, leaving out other couplings, is no better but
+worse: third bodies then see the flow of a body only where they touch it; the difference across
+their gaps looks like approach, and lubrication multiplies it by radius over gap.)
 
-A restricted density is the body's surface field on the sphere of directions, sampled on rings about
-the pair's line. Ranks hold the sides of their own bodies; the partner's side is exchanged.
+A density is restricted as a field on the sphere of directions, sampled on rings about the pair's
+line. Ranks hold the sides of their own bodies and exchange them with those of the partners.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dem_mpi.parallel import Parallel
 from stokes import _kernels_polar as kernels
 from stokes.formulation import OperatorCache, ShapeSolver
-from stokes.geometry import Meridian, Resolution
-from stokes.krylov import gmres
 from stokes.modes import to_modes
 from stokes.pairs import PairFactory, PairOperator, PairOptions, Partner, PolarGrid, is_sphere
 from stokes.preconditioner import Preconditioner
+from stokes.resolution import Resolution
 from stokes.suspension_layout import Field, Layout
 from stokes.suspension_table import BodyTable
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 Index = NDArray[np.int64]
 
 _ALIGNED = 1e-6  # sine of the angle between a line and an axis that are taken as one
@@ -43,22 +46,19 @@ _ALIGNED = 1e-6  # sine of the angle between a line and an axis that are taken a
 
 @dataclass(frozen=True)
 class NeighbourOptions:
-    """Which pairs are inverted, and how well.
+    """Which pairs are inverted, and how finely.
 
-    reach            : gap, over the smaller body's size, below which two bodies are a pair
-    pairs            : resolution of a pair
-    inner_tolerance  : of the system of all pairs; inner_iterations: at most so many
+    reach : gap, over the smaller body's scale, below which two bodies are a pair
+    pairs : resolution of a pair
     """
 
     reach: float = 0.5
     pairs: PairOptions = field(default_factory=PairOptions)
-    inner_tolerance: float = 3e-2
-    inner_iterations: int = 30
 
 
 @dataclass(frozen=True)
 class ClosePairs:
-    """Pairs of bodies with a common axis that are nearer than a reach.
+    """Pairs of bodies with a common axis that are nearer than a reach, one rank's bodies among.
 
     numbers : (k, 2) of the bodies in the table, a < b, in rising order
     line    : (k, 3) unit vectors from a to b
@@ -73,70 +73,83 @@ class ClosePairs:
 
     @classmethod
     def of(cls, table: BodyTable, reach: float) -> ClosePairs:
-        """Those with a body of this rank."""
-        pairs = table.pairs(table.bounding_radius + 0.5 * reach * table.scale)
-        pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-        between = table.centre[pairs[:, 1]] - table.centre[pairs[:, 0]]
+        """Those nearer than reach times the smaller scale, with a body of this rank."""
+        numbers = table.pairs(table.bounding_radius + 0.5 * reach * table.scale)
+        numbers = np.unique(np.sort(numbers, axis=1), axis=0)
+        between = table.centre[numbers[:, 1]] - table.centre[numbers[:, 0]]
         distance = np.linalg.norm(between, axis=1)
         line = between / distance[:, None]
-        sphere = np.array([is_sphere(c) for c in table.curves], dtype=bool)[table.curve[pairs]]
-        along = np.einsum("kbi,ki->kb", _axes(table.quaternion[pairs]), line)
-        across = np.sqrt(np.maximum(0.0, 1.0 - along**2))
-        # the pole of a sphere's grid is laid to its partner
+        curve, scale = table.curve[numbers], table.scale[numbers]
+        along = np.einsum("kbi,ki->kb", _rotations(table.quaternion[numbers])[..., 2], line)
+        sphere = np.array([is_sphere(c) for c in table.curves], dtype=bool)[curve]
+        # the pole of a sphere's polar grid is laid to its partner
         sign = np.where(sphere, (1, -1), np.where(along > 0.0, 1, -1))
-        height = np.empty(pairs.shape)
-        size = np.array([curve_size(c) for c in table.curves])[table.curve[pairs]]
-        for side, ahead in ((0, True), (1, False)):
-            for number, curve in enumerate(table.curves):
-                for s in (-1, 1):
-                    here = (table.curve[pairs[:, side]] == number) & (sign[:, side] == s)
-                    height[here, side] = Partner(curve, s, ahead).height
-        scale = table.scale[pairs]
+        heights = np.array(
+            [
+                [[Partner(c, s, a).height for s in (-1, 1)] for a in (True, False)]
+                for c in table.curves
+            ]
+        ).reshape(-1, 2, 2)
+        height = heights[curve, (0, 1), (sign + 1) // 2]
         gap = distance - np.sum(height * scale, axis=1)
-        kept = np.all(sphere | (across < _ALIGNED), axis=1)
-        kept &= (gap > 0.0) & (gap < reach * np.min(size * scale, axis=1))
-        return cls(pairs[kept], line[kept], sign[kept], gap[kept])
+        kept = np.all(sphere | (1.0 - np.abs(along) < 0.5 * _ALIGNED**2), axis=1)
+        kept &= (gap > 0.0) & (gap < reach * scale.min(axis=1, initial=np.inf))
+        return cls(numbers[kept], line[kept], sign[kept], gap[kept])
+
+    @property
+    def count(self) -> int:
+        """Number k of pairs."""
+        return len(self.gap)
+
+    @property
+    def frames(self) -> Array:
+        """Rotations (k, 3, 3) from the frames of the pairs, z along the line, to the world."""
+        across = np.zeros_like(self.line)
+        across[np.arange(self.count), np.argmin(np.abs(self.line), axis=1)] = 1.0
+        x = np.cross(across, self.line)
+        x /= np.linalg.norm(x, axis=1)[:, None]
+        return np.stack([x, np.cross(self.line, x), self.line], axis=2)
+
+    def operators(self, table: BodyTable, factory: PairFactory) -> list[PairOperator]:
+        """The operator of each pair; equal pairs have the same one."""
+        curve, scale = table.curve[self.numbers], table.scale[self.numbers]
+        return [
+            factory.pair(
+                Partner(table.curves[curve[k, 0]], int(self.sign[k, 0]), True),
+                Partner(table.curves[curve[k, 1]], int(self.sign[k, 1]), False),
+                scale[k, 1] / scale[k, 0],
+                self.gap[k] / scale[k, 0],
+            )
+            for k in range(self.count)
+        ]
 
 
-def curve_size(curve) -> float:
-    """Radius of the sphere with the unit shape's area."""
-    breaks = tuple(np.linspace(0.0, 1.0, 9).tolist())
-    return float(np.sqrt(Meridian(curve, Resolution(breaks, 16, 0)).area / (4.0 * np.pi)))
+@dataclass(frozen=True)
+class _Sides:
+    """Sides of pairs that are this rank's bodies; S of them.
 
+    row    : (S,) of the body in the layout
+    pair   : (S, 2) pair, and which of its two bodies
+    grid   : (S,) number of the polar grid in `grids`
+    place  : (S, 2) first coefficient in the flat array of all pairs' coefficients, and past the end
+    turn   : (S, 3, 3) from the frame of the pair to the body's
+    """
 
-def _axes(quaternion: Array) -> Array:
-    """Third columns of the rotations of unit quaternions (..., 4), scalar first."""
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=-1)
-
-
-def _rotations(quaternion: Array) -> Array:
-    """Rotation matrices (k, 3, 3) of unit quaternions (k, 4)."""
-    w, x, y, z = quaternion.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows).reshape(3, 3, -1), 2, 0)
-
-
-def _frames(line: Array) -> Array:
-    """Rotations (k, 3, 3) whose third columns are the unit vectors `line` (k, 3)."""
-    k = np.arange(len(line))
-    across = np.zeros_like(line)
-    across[k, np.argmin(np.abs(line), axis=1)] = 1.0
-    first = np.cross(across, line)
-    first /= np.linalg.norm(first, axis=1)[:, None]
-    return np.stack([first, np.cross(line, first), line], axis=2)
+    row: Index
+    pair: Index
+    grid: Index
+    place: Index
+    turn: Array
+    grids: tuple[PolarGrid, ...]
 
 
 class NeighbourSchwarz:
     """The one-body preconditioner and, on top of it, the close pairs of bodies.
 
     Pairs whose bodies share no axis (two spheroids side by side) are left to the iteration.
-    `flexible`: whether the outer iteration must be.
     """
+
+    flexible = False
 
     def __init__(
         self,
@@ -152,299 +165,241 @@ class NeighbourSchwarz:
     ) -> None:
         """Collective. Make the operators of the pairs of this rank's bodies.
 
-        one_body : the inverse of every body alone; layout, solvers: as it has them
+        one_body : the inverse of every body alone
+        solvers  : of this rank's shapes, by number in the layout
         cache    : gives and keeps the operators of bodies on polar grids
         free     : whether motions are unknown (loads given) or given
         """
         self._one_body, self._layout, self._parallel = one_body, layout, parallel
-        self.options = options or NeighbourOptions()
-        self._free = free
-        close = ClosePairs.of(table, self.options.reach)
-        self.pairs = len(close.gap)
-        self._some = parallel.any(self.pairs > 0)
-        self.flexible = False
+        self._options = options or NeighbourOptions()
+        close = ClosePairs.of(table, self._options.reach)
+        self._some = parallel.any(close.count > 0)
+        self.nbytes = 0
         if not self._some:
             return
-        pairs, frames = self._make_pairs(table, close, formulation, cache)
-        self._modes = self.options.pairs.modes
-        self._place(table, pairs, close.numbers, frames)
-        self._tabulate(solvers)
-        self.flexible = parallel.any(bool(self._linked))
+        factory = PairFactory(formulation, cache, free, self._options.pairs)
+        pairs = close.operators(table, factory)
+        self.nbytes = factory.nbytes
+        self._arrange(pairs)
+        owner = table.owner(close.numbers)
+        self._sides = self._own_sides(table, close, pairs, owner)
+        self._plan_exchange(owner, table.rank)
+        self._plan_restriction(solvers)
+        self._plan_lift(solvers)
 
     @property
-    def nbytes(self) -> int:
-        """Bytes of the pairs' operators."""
-        if not self._some:
-            return 0
-        return self._pair_bytes
+    def pairs(self) -> int:
+        """Pairs with a body of this rank."""
+        return len(self._place) if self._some else 0
 
     # ---- setup -------------------------------------------------------------------------------
 
-    def _make_pairs(
-        self,
-        table: BodyTable,
-        close: ClosePairs,
-        formulation: str,
-        cache: OperatorCache,
-    ) -> tuple[list[PairOperator], Array]:
-        if not self.pairs:
-            return [], np.empty((0, 3, 3))
-        factory = PairFactory(formulation, cache, self._free, self.options.pairs)
-        scale, curve = table.scale[close.numbers], table.curve[close.numbers]
-        pairs = [
-            factory.pair(
-                Partner(table.curves[curve[k, 0]], int(close.sign[k, 0]), True),
-                Partner(table.curves[curve[k, 1]], int(close.sign[k, 1]), False),
-                scale[k, 1] / scale[k, 0],
-                close.gap[k] / scale[k, 0],
-            )
-            for k in range(self.pairs)
-        ]
-        self._pair_bytes = factory.nbytes
-        return pairs, _frames(close.line)
-
-    def _place(
-        self, table: BodyTable, pairs: list[PairOperator], numbers: Index, frames: Array
-    ) -> None:
-        """Give every side of every pair its place in the flat array of coefficients.
+    def _arrange(self, pairs: Sequence[PairOperator]) -> None:
+        """Give every pair its place among the coefficients.
 
         Equal pairs stand next to each other, so that one product answers all of them.
         """
-        width = 3 * (self._modes + 1)
         distinct = {id(pair): pair for pair in pairs}
-        place = np.zeros(len(pairs), dtype=np.int64)
+        keys = list(distinct)
+        kind = np.array([keys.index(id(pair)) for pair in pairs], dtype=np.int64)
+        self._place = np.zeros((len(pairs), 3), dtype=np.int64)
         self._groups: list[tuple[PairOperator, slice, Index]] = []
+        width = 3 * (self._options.pairs.modes + 1)
         end = 0
-        for key, pair in distinct.items():
-            members = np.array([k for k, p in enumerate(pairs) if id(p) == key], dtype=np.int64)
-            size = pair.size * width
-            place[members] = end + size * np.arange(len(members))
-            self._groups.append((pair, slice(end, end + size * len(members)), members))
-            end += size * len(members)
+        for number, pair in enumerate(distinct.values()):
+            members = np.flatnonzero(kind == number)
+            bounds = width * np.cumsum([0, *(grid.size for grid in pair.grids)])
+            first = end + bounds[2] * np.arange(len(members))
+            self._place[members] = first[:, None] + bounds
+            self._groups.append((pair, slice(end, end + bounds[2] * len(members)), members))
+            end += int(bounds[2]) * len(members)
         self._length = end
-        grids: dict[PolarGrid, int] = {}
-        sides, ghosts = [], []
-        row_of = np.empty(self._layout.bodies, dtype=np.int64)
-        row_of[self._layout.order] = np.arange(self._layout.bodies)
-        first = int(table.first[table.rank])
-        rotation = _rotations(table.quaternion[table.own])
-        owner = table.owner(numbers)
-        for k, pair in enumerate(pairs):
-            start = int(place[k])
-            for b in (0, 1):
-                grid = pair.grids[b]
-                stop = start + grid.size * width
-                if owner[k, b] == table.rank:
-                    mine = int(numbers[k, b]) - first
-                    number = grids.setdefault(grid, len(grids))
-                    turn = rotation[mine].T @ frames[k]
-                    partner = int(owner[k, 1 - b])
-                    sides.append((int(row_of[mine]), number, start, stop, turn, k, b, partner))
-                else:
-                    ghosts.append((int(owner[k, b]), start, stop))
-                start = stop
-        self._grids = tuple(grids)
-        self._row = np.array([s[0] for s in sides], dtype=np.int64)
-        self._grid = np.array([s[1] for s in sides], dtype=np.int64)
-        self._start = np.array([s[2] for s in sides], dtype=np.int64)
-        self._turn = np.array([s[4] for s in sides]).reshape(-1, 3, 3)
-        self._side = np.array([(s[5], s[6]) for s in sides], dtype=np.int64).reshape(-1, 2)
-        self._own = _ranges([(s[2], s[3]) for s in sides])
-        away = [r for r in range(self._parallel.size) if r != self._parallel.rank]
-        self._send = {r: _ranges([(s[2], s[3]) for s in sides if s[7] == r]) for r in away}
-        self._receive = {r: _ranges([(g[1], g[2]) for g in ghosts if g[0] == r]) for r in away}
 
-    def _tabulate(self, solvers: Mapping[int, ShapeSolver]) -> None:
-        """Tables of the resampling kernels: body to pair, pair to pair, pair to body."""
-        layout = self._layout
-        self._pair_tables = _tables([(g.resolution, g.sign) for g in self._grids])
-        grid_of = {number: k for k, number in enumerate(solvers)}
-        self._body_tables = _tables([(s.operators.resolution, 1) for s in solvers.values()])
-        points = [len(g.directions) for g in self._grids]
-        first = np.concatenate([[0], np.cumsum(points)]).astype(np.int64)
-        self._ring_directions = np.concatenate(
-            [np.zeros((0, 3)), *(g.directions for g in self._grids)]
+    def _own_sides(
+        self, table: BodyTable, close: ClosePairs, pairs: Sequence[PairOperator], owner: Index
+    ) -> _Sides:
+        pair = np.argwhere(owner == table.rank)
+        grids: dict[PolarGrid, int] = {}
+        grid = [grids.setdefault(pairs[k].grids[b], len(grids)) for k, b in pair.tolist()]
+        mine = close.numbers[pair[:, 0], pair[:, 1]]
+        to_world = _rotations(table.quaternion[mine])
+        return _Sides(
+            row=self._layout.rows[mine - table.first[table.rank]],
+            pair=pair,
+            grid=np.array(grid, dtype=np.int64),
+            place=np.stack([self._place[pair[:, 0], pair[:, 1] + end] for end in (0, 1)], axis=1),
+            turn=np.swapaxes(to_world, 1, 2) @ close.frames[pair[:, 0]],
+            grids=tuple(grids),
         )
-        counts = np.array(points, dtype=np.int64)[self._grid]
-        rows = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        self._samples = int(rows[-1])
-        one_job = np.arange(len(self._row) + 1)
-        sides = (first[self._grid], counts, rows[:-1])
-        shape_of = np.zeros(layout.bodies, dtype=np.int64)
-        self._body_start = np.zeros(layout.bodies + 1, dtype=np.int64)
+
+    def _plan_exchange(self, owner: Index, rank: int) -> None:
+        """Which coefficients go to, and come from, the ranks of partners, in the order of pairs.
+
+        Bodies are numbered rank after rank, so that the lower rank has the first body of a pair.
+        """
+        self._send: dict[int, Index] = {}
+        self._receive: dict[int, Index] = {}
+        for other in np.setdiff1d(owner, rank).tolist():
+            shared = np.flatnonzero(np.any(owner == other, axis=1))
+            mine = 0 if rank < other else 1
+            for index, b in ((self._send, mine), (self._receive, 1 - mine)):
+                ranges = [np.arange(*self._place[k, b : b + 2]) for k in shared.tolist()]
+                index[other] = np.concatenate(ranges)
+
+    def _plan_restriction(self, solvers: Mapping[int, ShapeSolver]) -> None:
+        """Jobs of `resample` from bodies to sides, and of `analyse`."""
+        sides, layout = self._sides, self._layout
+        self._body_grids = _tables((s.operators.resolution, 1) for s in solvers.values())
+        number = {shape: k for k, shape in enumerate(solvers)}
+        grid = np.zeros(layout.bodies, dtype=np.int64)
+        size = np.zeros(layout.bodies, dtype=np.int64)
         for group in layout.groups:
+            grid[group.bodies] = number[group.shape]
             resolution = solvers[group.shape].operators.resolution
-            size = 3 * (resolution.modes + 1) * resolution.panels * resolution.nodes
-            shape_of[group.bodies] = grid_of[group.shape]
-            self._body_start[group.bodies.start + 1 : group.bodies.stop + 1] = size
-        self._body_start = np.cumsum(self._body_start)
+            size[group.bodies] = 3 * (resolution.modes + 1) * group.grid[0]
+        self._body_start = _starts(size)
+        rings = [grid.rings for grid in sides.grids]
+        points = np.array([ring.sum() for ring in rings], dtype=np.int64)
+        first_row = _starts(points[sides.grid])
+        self._samples = int(first_row[-1])
+        self._ring_directions = _stacked(grid.directions for grid in sides.grids)
         self._restriction = (
-            (*sides, one_job),
-            (shape_of[self._row], self._body_start[self._row], self._turn),
+            (
+                _starts(points)[sides.grid],
+                points[sides.grid],
+                first_row[:-1],
+                np.arange(len(sides.row) + 1),
+            ),
+            (grid[sides.row], self._body_start[sides.row], sides.turn),
         )
-        # pair to pair: the other sides of the same body
-        other = [
-            [m for m in np.flatnonzero(self._row == row).tolist() if m != k]
-            for k, row in enumerate(self._row.tolist())
-        ]
-        jobs = np.array([m for ms in other for m in ms], dtype=np.int64)
-        target = np.repeat(np.arange(len(other)), [len(ms) for ms in other])
-        self._linked = len(jobs)
-        ends = np.concatenate([[0], np.cumsum([len(ms) for ms in other])]).astype(np.int64)
-        turns = np.einsum("kji,kjl->kil", self._turn[jobs], self._turn[target])
-        self._transfer = ((*sides, ends), (self._grid[jobs], self._start[jobs], turns))
-        rings = [g.rings for g in self._grids]
-        ring_start = np.concatenate([[0], np.cumsum([len(rings[g]) for g in self._grid])])
-        self._analysis = (
-            rows[:-1],
-            ring_start.astype(np.int64),
-            np.concatenate([np.zeros(0, np.int64), *(rings[g] for g in self._grid)]),
-        )
-        # pair to body: directions of a shape's nodes on the sphere (s, theta)
-        clouds = [np.zeros((0, 3)), *(_node_directions(s) for s in solvers.values())]
-        cloud_start = np.cumsum([len(c) for c in clouds]).astype(np.int64)
-        self._node_directions = np.concatenate(clouds)
-        order = np.argsort(self._row, kind="stable")
-        ends = np.searchsorted(self._row[order], np.arange(layout.bodies + 1)).astype(np.int64)
+        ring_start = _starts([len(rings[g]) for g in sides.grid])
+        every_ring = np.concatenate([np.zeros(0, np.int64), *(rings[g] for g in sides.grid)])
+        self._analysis = (first_row[:-1], ring_start, every_ring)
+
+    def _plan_lift(self, solvers: Mapping[int, ShapeSolver]) -> None:
+        """Jobs of `resample` from sides to bodies."""
+        sides, layout = self._sides, self._layout
+        self._side_grids = _tables((grid.resolution, grid.sign) for grid in sides.grids)
+        clouds = [_node_directions(solver) for solver in solvers.values()]
+        self._node_directions = _stacked(clouds)
+        cloud_start = dict(zip(solvers, _starts([len(c) for c in clouds]).tolist(), strict=False))
+        first = np.zeros(layout.bodies, dtype=np.int64)
+        for group in layout.groups:
+            first[group.bodies] = cloud_start[group.shape]
+        order = np.argsort(sides.row, kind="stable")
+        jobs = np.searchsorted(sides.row[order], np.arange(layout.bodies + 1))
         self._lift = (
-            (cloud_start[shape_of], np.diff(layout.offsets), layout.offsets[:-1], ends),
-            (self._grid[order], self._start[order], np.swapaxes(self._turn[order], 1, 2).copy()),
+            (first, np.diff(layout.offsets), layout.offsets[:-1], jobs),
+            (
+                sides.grid[order],
+                sides.place[order, 0],
+                np.ascontiguousarray(np.swapaxes(sides.turn[order], 1, 2)),
+            ),
         )
 
     # ---- application -------------------------------------------------------------------------
 
     def apply(self, residual: Field) -> Field:
         """Collective. Approximate unknowns of a residual."""
-        x = self._one_body.apply(residual)
+        alone = self._one_body.apply(residual)
         if not self._some:
-            return x
-        restricted = self._restrict(x.nodal)
-        psi = self._reflect(self._exchanged(restricted))
-        if self.flexible:
-            psi = self._solve_linked(psi)
-        correction = np.empty_like(x.nodal)
-        kernels.resample.serial(
-            self._pair_tables, *self._lift, psi, self._node_directions, correction
-        )
-        motion = x.rigid
-        if motion is not None:
-            if self.flexible:
-                restricted = restricted - self._transferred(psi)
-            motion = motion - self._motions(self._exchanged(restricted))
-        return Field(x.nodal - correction, motion)
+            return alone
+        t = self._restricted(alone.nodal)
+        self._exchange(t)
+        psi, motions = np.empty_like(t), np.zeros((self.pairs, 2, 6))
+        for pair, place, members in self._groups:
+            block = t[place].reshape(len(members), pair.size, -1, 3)
+            psi[place] = pair.apply(block).ravel()
+            if alone.rigid is not None:
+                motions[members] = pair.motions(block)
+        density = np.empty_like(alone.nodal)
+        kernels.resample.serial(self._side_grids, *self._lift, psi, self._node_directions, density)
+        np.subtract(alone.nodal, density, out=density)
+        if alone.rigid is None:
+            return Field(density)
+        return Field(density, alone.rigid - self._motions_of_bodies(motions))
 
-    def _restrict(self, nodal: Array) -> NDArray[np.complex128]:
-        """R: coefficients of a density on this rank's sides, zero on others."""
-        field = np.empty(self._body_start[-1], dtype=np.complex128)
+    def _restricted(self, nodal: Array) -> Complex:
+        """R x: coefficients of a density on this rank's sides; the other places are zero."""
+        modes = np.empty(self._body_start[-1], dtype=np.complex128)
         for group in self._layout.groups:
             rows = to_modes(group.columns(nodal))
-            size = rows.shape[2] // 3
-            parts = rows.reshape(len(rows), group.count, 2, 3, size)
-            modes = np.moveaxis(parts[:, :, 0] + 1j * parts[:, :, 1], (1, 3, 0, 2), (0, 1, 2, 3))
+            parts = rows.reshape(len(rows), group.count, 2, 3, -1)
             first, last = self._body_start[[group.bodies.start, group.bodies.stop]]
-            field[first:last] = modes.ravel()
-        return self._sampled(self._body_tables, self._restriction, field)
-
-    def _transferred(self, psi: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """T psi: what the other pairs of a body leave on each of its sides."""
-        return self._sampled(self._pair_tables, self._transfer, psi)
-
-    def _sampled(self, tables, transfer, field) -> NDArray[np.complex128]:
+            # (mode, body, component, node) to (body, node, mode, component)
+            modes[first:last] = np.moveaxis(
+                parts[:, :, 0] + 1j * parts[:, :, 1], (1, 3, 0, 2), (0, 1, 2, 3)
+            ).ravel()
         values = np.empty((self._samples, 3))
-        kernels.resample.serial(tables, *transfer, field, self._ring_directions, values)
+        kernels.resample.serial(
+            self._body_grids, *self._restriction, modes, self._ring_directions, values
+        )
         coefficients = np.zeros(self._length, dtype=np.complex128)
-        kernels.analyse.serial(values, *self._analysis, self._modes, self._start, coefficients)
+        kernels.analyse.serial(
+            values,
+            *self._analysis,
+            self._options.pairs.modes,
+            self._sides.place[:, 0].copy(),
+            coefficients,
+        )
         return coefficients
 
-    def _exchanged(self, coefficients: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def _exchange(self, coefficients: Complex) -> None:
         """Collective. Fill in the sides of bodies of other ranks."""
         if self._parallel.size == 1:
-            return coefficients
+            return
         arrived = self._parallel.exchange(
-            {r: coefficients[index].tobytes() for r, index in self._send.items() if len(index)}
+            {rank: coefficients[index].tobytes() for rank, index in self._send.items()}
         )
-        for source, message in arrived.items():
-            coefficients[self._receive[source]] = np.frombuffer(message, dtype=np.complex128)
-        return coefficients
+        for rank, message in arrived.items():
+            coefficients[self._receive[rank]] = np.frombuffer(message, dtype=np.complex128)
 
-    def _reflect(self, t: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """P t of every pair."""
-        psi = np.empty_like(t)
-        for pair, place, members in self._groups:
-            block = t[place].reshape(len(members), pair.size, self._modes + 1, 3)
-            psi[place] = pair.apply(block).ravel()
-        return psi
-
-    def _solve_linked(self, right: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Collective. psi of (1 + P T) psi = right, on this rank's sides."""
-
-        def spread(values: Array) -> NDArray[np.complex128]:
-            whole = np.zeros(self._length, dtype=np.complex128)
-            whole[self._own] = np.ascontiguousarray(values).view(np.complex128)
-            return whole
-
-        def operator(values: Array) -> Array:
-            psi = spread(values)
-            psi += self._reflect(self._exchanged(self._transferred(psi)))
-            return psi[self._own].view(np.float64)
-
-        found = gmres(
-            operator,
-            lambda values: values,
-            right[self._own].view(np.float64),
-            self.options.inner_tolerance,
-            self.options.inner_iterations,
-            self.options.inner_iterations,
-            False,
-            self._parallel,
-        )
-        self.inner_iterations = found.iterations
-        return spread(found.unknown)
-
-    def _motions(self, t: NDArray[np.complex128]) -> Array:
-        """Motions (b, 6) that the pairs take away from those of the bodies alone."""
-        by_pair = np.zeros((self.pairs, 2, 6))
-        for pair, place, members in self._groups:
-            block = t[place].reshape(len(members), pair.size, self._modes + 1, 3)
-            by_pair[members] = pair.motions(block)
-        mine = by_pair[self._side[:, 0], self._side[:, 1]].reshape(-1, 2, 3)
-        local = np.einsum("kij,kbj->kbi", self._turn, mine).reshape(-1, 6)
+    def _motions_of_bodies(self, motions: Array) -> Array:
+        """Sums (b, 6), in the bodies' frames, of motions (k, 2, 6) in those of the pairs."""
+        sides = self._sides
+        mine = motions[sides.pair[:, 0], sides.pair[:, 1]].reshape(-1, 2, 3)
         total = np.zeros((self._layout.bodies, 6))
-        np.add.at(total, self._row, local)
+        np.add.at(total, sides.row, (mine @ np.swapaxes(sides.turn, 1, 2)).reshape(-1, 6))
         return total
 
 
-def _ranges(bounds: list[tuple[int, int]]) -> Index:
-    return np.concatenate([np.zeros(0, np.int64), *(np.arange(a, b) for a, b in bounds)])
+def _rotations(quaternion: Array) -> Array:
+    """Matrices (..., 3, 3), local to world, of unit quaternions (..., 4), scalar first."""
+    flat = quaternion.reshape(-1, 4)[:, [1, 2, 3, 0]]
+    if len(flat) == 0:
+        return np.zeros((*quaternion.shape[:-1], 3, 3))
+    return Rotation.from_quat(flat).as_matrix().reshape(*quaternion.shape[:-1], 3, 3)
 
 
-def _tables(grids: Sequence[tuple[Resolution, int]]) -> tuple:
+def _starts(sizes: Sequence[int] | Index) -> Index:
+    return np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+
+
+def _stacked(clouds: Iterable[Array]) -> Array:
+    return np.concatenate([np.zeros((0, 3)), *clouds])
+
+
+def _tables(grids: Iterable[tuple[Resolution, int]]) -> tuple:
     """Tables of polar grids as `_kernels_polar.resample` takes them."""
-    count = len(grids)
-    most_panels = max((r.panels for r, _ in grids), default=1)
-    most_nodes = max((r.nodes for r, _ in grids), default=1)
-    breaks = np.ones((count, most_panels + 1))
-    gauss, barycentric = np.zeros((2, count, most_nodes))
+    grids = list(grids)
+    most_panels = max((resolution.panels for resolution, _ in grids), default=1)
+    most_nodes = max((resolution.nodes for resolution, _ in grids), default=1)
+    breaks = np.ones((len(grids), most_panels + 1))
+    gauss, barycentric = np.zeros((2, len(grids), most_nodes))
     for g, (resolution, _) in enumerate(grids):
-        x, w = np.polynomial.legendre.leggauss(resolution.nodes)
+        q = resolution.nodes
+        x, w = np.polynomial.legendre.leggauss(q)
         breaks[g, : resolution.panels + 1] = resolution.breaks
-        gauss[g, : resolution.nodes] = x
-        signs = (-1.0) ** np.arange(resolution.nodes)
-        barycentric[g, : resolution.nodes] = signs * np.sqrt((1.0 - x * x) * w)
-    integers = [
-        [r.panels for r, _ in grids],
-        [r.nodes for r, _ in grids],
-        [r.modes for r, _ in grids],
-    ]
-    panels, nodes, modes = (np.array(values, dtype=np.int64) for values in integers)
-    sign = np.array([s for _, s in grids], dtype=np.float64)
+        gauss[g, :q] = x
+        barycentric[g, :q] = (-1.0) ** np.arange(q) * np.sqrt((1.0 - x * x) * w)
+    counts = np.array([(r.panels, r.nodes, r.modes) for r, _ in grids], dtype=np.int64)
+    panels, nodes, modes = np.ascontiguousarray(counts.reshape(-1, 3).T)
+    sign = np.array([sign for _, sign in grids], dtype=np.float64)
     return panels, nodes, modes, sign, breaks, gauss, barycentric
 
 
 def _node_directions(solver: ShapeSolver) -> Array:
     """Directions (n, 3) that stand for a shape's nodes: polar angle pi s, azimuth theta."""
-    polar, theta = np.pi * solver.operators.meridian.s, solver.grid.theta
-    x = np.sin(polar)[:, None] * np.cos(theta)
-    y = np.sin(polar)[:, None] * np.sin(theta)
-    z = np.repeat(np.cos(polar)[:, None], len(theta), axis=1)
-    return np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    polar, theta = np.pi * solver.operators.meridian.s[:, None], solver.grid.theta
+    x, y = np.sin(polar) * np.cos(theta), np.sin(polar) * np.sin(theta)
+    return np.stack([x, y, np.broadcast_to(np.cos(polar), x.shape)], axis=-1).reshape(-1, 3)
