@@ -10,18 +10,18 @@ from stokes._kernels_modal import modal_modes, new_workspace
 
 @jit_threads
 def assemble(kind, nodes, weight, difference, offsets, panel_nodes, first, rule, out):
-    """out[n, i + a N, j + b N]: mode n, from component b at node j to component a at node i.
+    """out[n, i + a T, j + b N]: mode n, from component b at node j to component a at node i.
 
     nodes       : (N, 4) r, z, nu_r, nu_z;  weight : (N,) line weight times r
-    difference, offsets : (N, N, 2) of targets i and sources j, see `stokes.modal`
-    first       : (N + 1,) first pair of each target in the rule
+    difference, offsets : (T, N, 2) of the first T nodes as targets and all, see `stokes.modal`
+    first       : (T + 1,) first pair of each target in the rule
     rule        : pairs (m, 2), starts (m + 1,), weights times r (q,), interpolation
                   (q, panel_nodes), points (q, 4), difference (q, 2), offsets (q, 2)
     """
     pairs, starts, rule_weight, interpolation, points, rule_difference, rule_offsets = rule
-    N = nodes.shape[0]
+    T, N = difference.shape[0], nodes.shape[0]
     n_max = out.shape[0] - 1
-    for i in prange(N):
+    for i in prange(T):
         workspace = new_workspace(n_max)
         block = np.empty((n_max + 1, 3, 3))
         row = np.zeros((n_max + 1, 3, 3, N))
@@ -47,7 +47,7 @@ def assemble(kind, nodes, weight, difference, offsets, panel_nodes, first, rule,
         for n in range(n_max + 1):
             for a in range(3):
                 for b in range(3):
-                    out[n, i + a * N, b * N : (b + 1) * N] = row[n, a, b]
+                    out[n, i + a * T, b * N : (b + 1) * N] = row[n, a, b]
 
 
 @jit

@@ -35,7 +35,6 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import lapack
 
 from stokes.geometry import Curve, Resolution
-from stokes.modes import from_modes, to_modes
 from stokes.operators import Layer, ModalOperators
 
 Array = NDArray[np.float64]
@@ -109,19 +108,19 @@ class ShapeSolver:
 
     def apply(self, density: Array) -> Array:
         """A q on the nodes; density and result (n_s, n_theta, 3[, m])."""
-        return self._multiply(self.matrices, density)
+        return self.operators.multiply(self.matrices, density)
 
     def solve(self, field: Array) -> Array:
         """A^-1 u; field and result (n_s, n_theta, 3[, m])."""
-        coefficients = to_modes(field)
-        for (lu, pivots), rows in zip(self._factors, coefficients, strict=True):
+        coefficients = self.operators.to_rows(field)
+        for (lu, pivots), rows in zip(self._factors, _blocks(coefficients), strict=True):
             # The rows are the columns of a Fortran array, which LAPACK overwrites in place.
             solution, info = lapack.dgetrs(lu, pivots, rows.T, trans=1, overwrite_b=1)
             if info != 0:
                 raise ValueError(f"dgetrs: argument {-info} is illegal")
             if not np.shares_memory(solution, rows):
                 rows[:] = solution.T
-        return from_modes(coefficients, self.grid.shape[1], np.shape(field)[3:])
+        return self.operators.from_rows(coefficients, np.shape(field)[3:])
 
     def smooth_self(self, density: Array, refinement: tuple[int, int] = (1, 1)) -> Array:
         """What a sum over surface nodes, own node left out, gives at the nodes: the plain rule.
@@ -130,7 +129,7 @@ class ShapeSolver:
         sources adds up of this body itself, (n_s, n_theta, 3[, m]). The sources may be refined:
         so many times the azimuths and the Gauss nodes of panels, the density interpolated.
         """
-        return self._multiply(self._plain(refinement), density)
+        return self.operators.multiply(self._plain(refinement), density)
 
     def self_correction(self, density: Array, refinement: tuple[int, int] = (1, 1)) -> Array:
         """`apply` minus `smooth_self`, by one product with matrices that are kept."""
@@ -139,7 +138,7 @@ class ShapeSolver:
             self._corrections[refinement] = self.matrices - self._plain(refinement)
             # An iteration needs this and the factorisation, no longer the matrices themselves.
             del self.matrices
-        return self._multiply(self._corrections[refinement], density)
+        return self.operators.multiply(self._corrections[refinement], density)
 
     @property
     def coefficients(self) -> tuple[float, float]:
@@ -216,7 +215,7 @@ class ShapeSolver:
         carrier = np.tensordot(self.rigid_motions, np.linalg.solve(self._motion_gram, load), axes=1)
         inside = self.apply(carrier) - carrier  # P of a rigid motion is itself
         density = carrier + self.solve(field - inside)
-        velocity = self._multiply(self.operators.matrices(Layer.SINGLE), density)
+        velocity = self.operators.apply(Layer.SINGLE, density)
         motion = self.mean_motion(velocity)
         return density, motion[:3], motion[3:]
 
@@ -241,7 +240,7 @@ class ShapeSolver:
 
     @cached_property
     def matrices(self) -> Array:
-        """The operator (modes + 1, 3 n_s, 3 n_s) in the real form of `stokes.modes`."""
+        """The operator (modes + 1, parts, k, k), as `ModalOperators.matrices`."""
         kinds = _KINDS[self.formulation]
         matrices = self._compose({kind: self.operators.matrices(kind) for kind in kinds})
         self._add_identity_and_lift(matrices)
@@ -258,27 +257,27 @@ class ShapeSolver:
 
     def condition_numbers(self) -> Array:
         """Condition of each mode in the norm of L2 on the surface, (modes + 1,)."""
-        root = np.sqrt(self._line_weights)
-        scaled = root[:, None] * self.matrices / root
-        values = np.linalg.svd(scaled, compute_uv=False)
-        return values[:, 0] / values[:, -1]
+        rows = self.matrices.shape[-1] // 3
+        root = np.tile(np.sqrt(self._line_weights[:rows]), 3)
+        values = np.linalg.svd(root[:, None] * self.matrices / root, compute_uv=False)
+        return values.max(axis=(1, 2)) / values.min(axis=(1, 2))
 
     @cached_property
     def _factors(self) -> list[tuple[Array, NDArray]]:
         """LU of the transposes: to LAPACK, a matrix in C order is its transpose."""
         factors = []
-        for n, matrix in enumerate(self.matrices):
+        for k, matrix in enumerate(_blocks(self.matrices)):
             lu, pivots, info = lapack.dgetrf(matrix.T)
             if info != 0:
-                raise ValueError(f"{self.formulation}: mode {n} is singular")
+                n = k // self.operators.parts
+                raise ValueError(f"formulation {self.formulation}: mode {n} is singular")
             factors.append((lu, pivots))
         return factors
 
     @cached_property
     def _line_weights(self) -> Array:
-        """Weights of int . r dl for vectors (component, node), (3 n_s,)."""
-        meridian = self.operators.meridian
-        return np.tile(meridian.weights * meridian.r, 3)
+        """Weights of int . r dl, (n_s,)."""
+        return self.operators.meridian.weights * self.operators.meridian.r
 
     def _plain(self, refinement: tuple[int, int]) -> Array:
         kinds = _KINDS[self.formulation]
@@ -297,20 +296,20 @@ class ShapeSolver:
         return total
 
     def _add_identity_and_lift(self, matrices: Array) -> None:
-        diagonal = np.arange(matrices.shape[1])
-        matrices[:, diagonal, diagonal] += _IDENTITY[self.formulation]
+        diagonal = np.arange(matrices.shape[-1])
+        matrices[:, :, diagonal, diagonal] += _IDENTITY[self.formulation]
         if self.formulation in (Formulation.SINGLE, Formulation.INTERIOR):
             meridian = self.operators.meridian
             n = np.concatenate([meridian.normal_r, np.zeros(meridian.size), meridian.normal_z])
             weight = self.length if self.formulation is Formulation.SINGLE else 1.0
-            area = self._line_weights[: meridian.size].sum()
-            matrices[0] += np.outer(weight / area * n, n * self._line_weights)
+            weighted = n * np.tile(self._line_weights / self._line_weights.sum(), 3)
+            matrices[0] += self.operators.fold(np.outer(weight * n, weighted))
         elif self.formulation is Formulation.TRACTION:
             for n, projection in enumerate(self._projections()):
                 matrices[n] += projection
 
     def _projections(self) -> list[Array]:
-        """P in modes 0 and 1, the only ones of rigid motions; (3 n_s, 3 n_s) each."""
+        """P in modes 0 and 1, the only ones of rigid motions; shaped as a mode of `matrices`."""
         r, z = self.operators.meridian.r, self.operators.meridian.z
         zero, one = np.zeros_like(r), np.ones_like(r)
         # Real form: e_z and e_z cross x in mode 0; e_x and e_x cross x, to a factor, in mode 1.
@@ -321,13 +320,10 @@ class ShapeSolver:
         projections = []
         for pair in motions[: self.operators.resolution.modes + 1]:
             basis = np.stack([np.concatenate(motion) for motion in pair], axis=1)
-            weighted = self._line_weights[:, None] * basis
-            projections.append(basis @ np.linalg.solve(basis.T @ weighted, weighted.T))
+            weighted = np.tile(self._line_weights, 3)[:, None] * basis
+            full = basis @ np.linalg.solve(basis.T @ weighted, weighted.T)
+            projections.append(self.operators.fold(full))
         return projections
-
-    def _multiply(self, matrices: Array, density: Array) -> Array:
-        rows = to_modes(density) @ np.swapaxes(matrices, 1, 2)
-        return from_modes(rows, self.grid.shape[1], np.shape(density)[3:])
 
 
 class OperatorCache:
@@ -373,6 +369,11 @@ class OperatorCache:
         """Forget the layers' own matrices, which solvers already made no longer need."""
         for operators in self._operators.values():
             operators.release()
+
+
+def _blocks(values: Array) -> Array:
+    """Modes and parts on one axis."""
+    return values.reshape(-1, *values.shape[2:])
 
 
 def rigid_motions(points: Array) -> Array:

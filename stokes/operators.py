@@ -13,7 +13,7 @@ target's are taken at their nodes; the target's panel and those it nearly touche
 singular kernel, on which the density is interpolated (Nyström's method; S. De, PhD thesis,
 University of Michigan 2021, section 3.3, with other rules).
 
-Symbols: n_s nodes of the meridian, M modes; matrices (M + 1, 3 n_s, 3 n_s).
+Symbols: n_s nodes of the meridian, m fields.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from stokes._kernels_plain import plain_modes
 from stokes.fmm._threads import limited_threads
 from stokes.geometry import Curve, Meridian, Resolution, SurfaceGrid
 from stokes.modal import KINDS
+from stokes.modes import from_modes, to_modes
 from stokes.quadrature import PanelRule, gauss_legendre, interpolation_matrix, self_rule
 
 Array = NDArray[np.float64]
@@ -39,6 +40,10 @@ Array = NDArray[np.float64]
 # Nodes closer than this, relative to the body, take their differences from the curve: those of
 # their coordinates would lose two digits or more.
 _CLOSE = 0.1
+# What nodes may differ from their mirror image by, relative to the body.
+_ROUNDING = 1e-13
+# Signs of (f_r, f_theta, f_z) in the mirror image of a field.
+_MIRROR = np.array([1.0, 1.0, -1.0])[:, None]
 
 
 class Layer(StrEnum):
@@ -64,6 +69,11 @@ _PLAIN = {
 class ModalOperators:
     """S, D and T of one unit shape at one resolution; each is assembled when first asked for.
 
+    A meridian that is its own mirror image, nodes and all, takes even fields to even ones and odd
+    to odd: a matrix falls apart into `parts` = 2 of half the size, else `parts` = 1. Even is a
+    field with f(r, -z) = (f_r, f_theta, -f_z)(r, z). Matrices then have only the rows of the
+    northern half of the nodes, and half of the kernel's values is never computed.
+
     meridian, grid : its nodes;  threads : that assembly may use (any number gives the same bits)
     """
 
@@ -73,19 +83,24 @@ class ModalOperators:
         self.threads = threads
         self.meridian = Meridian(curve, resolution)
         self.grid = SurfaceGrid(self.meridian)
+        self.parts = 2 if _is_mirrored(self.meridian) else 1
         self._matrices: dict[Layer, Array] = {}
 
     def matrices(self, layer: Layer | str) -> Array:
-        """The layer's matrices (modes + 1, 3 n_s, 3 n_s), read-only and kept."""
+        """The layer's matrices (modes + 1, parts, 3 n_s / parts, 3 n_s / parts), kept."""
         layer = Layer(layer)
         if layer not in self._matrices:
-            matrices = self._assembled(layer)
+            matrices = self.fold(self._assembled(layer))
             matrices.setflags(write=False)
             self._matrices[layer] = matrices
         return self._matrices[layer]
 
+    def apply(self, layer: Layer | str, field: Array) -> Array:
+        """The layer of a density (n_s, n_theta, 3[, m]) on the surface, its principal value."""
+        return self.multiply(self.matrices(layer), field)
+
     def plain(self, layer: Layer | str, refinement: tuple[int, int] = (1, 1)) -> Array:
-        """The same of the plain product rule with the term x = x' left out, (modes + 1, ...).
+        """Matrices as those of `matrices`, of the plain product rule without the term x = x'.
 
         refinement : so many times the azimuths, so many times the Gauss nodes of each panel, to
         which densities are first interpolated
@@ -93,12 +108,11 @@ class ModalOperators:
         azimuth, nodes = refinement[0], refinement[1] * self.resolution.nodes
         fine = Meridian(self.curve, replace(self.resolution, nodes=nodes))
         cosine, sine = self._transform(azimuth * self.resolution.angles)
-        size = 3 * self.meridian.size
-        plain = np.empty((self.resolution.modes + 1, size, 3 * fine.size))
+        plain = np.empty((self.resolution.modes + 1, 3 * self._rows, 3 * fine.size))
         with limited_threads(self.threads):
             plain_modes.using(self.threads)(
                 _PLAIN[Layer(layer)],
-                _node_table(self.meridian),
+                _node_table(self.meridian)[: self._rows],
                 _node_table(fine),
                 fine.weights * fine.r,
                 2.0 * math.pi / (azimuth * self.resolution.angles),
@@ -106,9 +120,9 @@ class ModalOperators:
                 sine,
                 plain,
             )
-        if refinement[1] == 1:
-            return plain
-        return plain @ np.kron(np.eye(3), self._panel_interpolation(nodes))
+        if refinement[1] > 1:
+            plain = plain @ np.kron(np.eye(3), self._panel_interpolation(nodes))
+        return self.fold(plain)
 
     @property
     def nbytes(self) -> int:
@@ -121,10 +135,60 @@ class ModalOperators:
         for name in ("_rule", "_separations"):
             self.__dict__.pop(name, None)
 
+    # ---- coefficients ------------------------------------------------------------------------
+
+    def to_rows(self, field: Array) -> Array:
+        """Coefficients (modes + 1, parts, 2 m, 3 n_s / parts) of fields (n_s, n_theta, 3[, m])."""
+        rows = to_modes(field)
+        modes, count, _ = rows.shape
+        if self.parts == 1:
+            return rows[:, None]
+        north, south = self._halves(rows.reshape(modes, count, 3, -1))
+        halves = np.stack([0.5 * (north + south), 0.5 * (north - south)], axis=1)
+        return halves.reshape(modes, 2, count, -1)
+
+    def from_rows(self, rows: Array, fields: tuple[int, ...] = ()) -> Array:
+        """Fields (n_s, n_theta, 3) + fields of such coefficients; `fields` is () or (m,)."""
+        modes, _, count, _ = rows.shape
+        if self.parts == 2:
+            even, odd = np.moveaxis(rows.reshape(modes, 2, count, 3, -1), 1, 0)
+            south = (_MIRROR * (even - odd))[..., ::-1]
+            rows = np.concatenate([even + odd, south], axis=-1)
+        return from_modes(rows.reshape(modes, count, -1), self.grid.shape[1], fields)
+
+    def multiply(self, matrices: Array, field: Array) -> Array:
+        """Fields (n_s, n_theta, 3[, m]) that matrices, shaped as `matrices`' are, make of such."""
+        rows = self.to_rows(field) @ np.swapaxes(matrices, -1, -2)
+        return self.from_rows(rows, np.shape(field)[3:])
+
+    def fold(self, matrices: Array) -> Array:
+        """Parts (..., parts, k, k) of matrices (..., 3 n_s or only the northern rows, 3 n_s)."""
+        if self.parts == 1:
+            return matrices[..., None, :, :]
+        size, n_s = 3 * self._rows, self.meridian.size
+        if matrices.shape[-2] > size:
+            rows = matrices.reshape(*matrices.shape[:-2], 3, n_s, 3 * n_s)[..., : self._rows, :]
+            matrices = rows.reshape(*matrices.shape[:-2], size, 3 * n_s)
+        north, south = self._halves(matrices.reshape(*matrices.shape[:-1], 3, n_s))
+        parts = np.stack([north + south, north - south], axis=-4)
+        return parts.reshape(*matrices.shape[:-2], 2, size, size)
+
+    @property
+    def _rows(self) -> int:
+        """Nodes whose rows are kept: the northern ones or all."""
+        return self.meridian.size // self.parts
+
+    def _halves(self, values: Array) -> tuple[Array, Array]:
+        """Values (..., 3, n_s) on the northern nodes and, mirrored onto them, the southern ones."""
+        half = self._rows
+        return values[..., :half], _MIRROR * values[..., : half - 1 : -1]
+
+    # ---- assembly ----------------------------------------------------------------------------
+
     def _assembled(self, layer: Layer) -> Array:
-        N = self.meridian.size
+        """Rows of the matrices, (modes + 1, 3 n_s / parts, 3 n_s)."""
         rule = self._rule
-        matrices = np.empty((self.resolution.modes + 1, 3 * N, 3 * N))
+        matrices = np.empty((self.resolution.modes + 1, 3 * self._rows, 3 * self.meridian.size))
         with limited_threads(self.threads):
             assemble.using(self.threads)(
                 KINDS[_KERNEL[layer]],
@@ -132,7 +196,7 @@ class ModalOperators:
                 self.meridian.weights * self.meridian.r,
                 *self._separations,
                 self.resolution.nodes,
-                np.searchsorted(rule.pairs[:, 0], np.arange(N + 1)),
+                np.searchsorted(rule.pairs[:, 0], np.arange(self._rows + 1)),
                 (
                     rule.pairs,
                     rule.starts,
@@ -152,20 +216,21 @@ class ModalOperators:
 
     @cached_property
     def _rule(self) -> PanelRule:
-        return self_rule(self.meridian)
+        return self_rule(self.meridian, self.meridian.s[: self._rows])
 
     @cached_property
     def _separations(self) -> tuple[Array, Array]:
-        """Differences and normal offsets between nodes, (n_s, n_s, 2) each.
+        """Differences and normal offsets between nodes, (n_s / parts, n_s, 2) each.
 
         Far apart, those of the coordinates have all the digits there are.
         """
         nodes, s = _node_table(self.meridian), self.meridian.s
-        difference = nodes[:, None, :2] - nodes[None, :, :2]
+        targets = nodes[: self._rows]
+        difference = targets[:, None, :2] - nodes[:, :2]
         offsets = np.stack(
             [
-                np.einsum("...k,...k", side, difference)
-                for side in (nodes[:, None, 2:], nodes[None, :, 2:])
+                np.einsum("...k,...k", normals, difference)
+                for normals in (targets[:, None, 2:], nodes[:, 2:])
             ],
             axis=-1,
         )
@@ -195,3 +260,11 @@ class ModalOperators:
 def _node_table(meridian: Meridian) -> Array:
     """r, z, nu_r, nu_z of the nodes, (n_s, 4)."""
     return np.column_stack([meridian.r, meridian.z, meridian.normal_r, meridian.normal_z])
+
+
+def _is_mirrored(meridian: Meridian) -> bool:
+    """Whether the nodes are their own mirror image in z = 0, to round-off."""
+    nodes = _node_table(meridian)
+    image = nodes[::-1] * [1.0, -1.0, 1.0, -1.0]
+    size = np.repeat([meridian.curve.bounding_radius, 1.0], 2)
+    return meridian.size % 2 == 0 and bool(np.all(np.abs(nodes - image) < _ROUNDING * size))
