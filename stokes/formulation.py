@@ -77,18 +77,22 @@ class ShapeSolver:
 
     eta : weight of the single layer in `combined` and `completed`. At 1.5 `combined` is best
     conditioned on the sphere and within 5 % of best elsewhere. Condition numbers in the norm of L2
-    on the surface, worst over the modes, independent of the resolution (of `single`, with 64 nodes
-    on the meridian; it doubles with their number and more next to the poles):
+    on the surface, worst over the modes, of `single` with 64 equally spaced nodes on the meridian:
 
-                            combined   completed   traction   interior   single
-        sphere                  2.0        5.0         5.0        2.5     1.6e3
-        spheroid 0.5 : 1        3.2         14          13        7.3     1.6e3
-        spheroid 1 : 0.5        2.6         11          11        5.4     1.5e3
-        spheroid 1 : 5          6.4        116
-        rod, aspect 5           4.5        114
+                              combined  completed  traction  interior  single
+        sphere                   2.0        5.0        5.0      2.5      1200
+        spheroid 0.5 : 1         3.2       14         13        7.3      1600
+        spheroid 1 : 0.5         2.6       10         10        5.4      1500
+        spheroid 1 : 5           6.4      120        130       47        2400
+        rod, aspect 5            4.5      110        130       62
+        spheroid 1 : 20         18      11000      15000      810        9700
+        spheroid 20 : 1         33       9100       9100     1900       13000
+        rod, aspect 20           7.1     9200      14000     1200
 
-    On slender bodies `completed` and `traction` suffer, as bending motions, too, nearly solve
-    (1/2 + D) q = 0; a single layer all over the surface makes that good.
+    Those of the second kind do not depend on the resolution, that of `single` is proportional to
+    the number of nodes. On slender and flat bodies not only rigid motions but bending ones, too,
+    nearly solve (1/2 + D) q = 0: a single layer all over the surface makes good what the six of
+    `completed` cannot.
     """
 
     def __init__(
@@ -97,6 +101,9 @@ class ShapeSolver:
         formulation: Formulation | str = Formulation.COMBINED,
         eta: float = DEFAULT_ETA,
     ) -> None:
+        """Raises ValueError without modes 0 and 1, which rigid motions have."""
+        if operators.resolution.modes < 1:
+            raise ValueError("a body of one azimuth has no rigid motions: at least one mode wanted")
         self.operators = operators
         self.formulation = Formulation(formulation)
         self.eta = float(eta)
