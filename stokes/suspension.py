@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from dem_mpi.parallel import Parallel
 from stokes.background import BackgroundFlow
+from stokes.coarse import MOST_BODIES, CoarseForces
 from stokes.fmm._requests import raised_together
 from stokes.formulation import DEFAULT_ETA, OperatorCache, ShapeSolver
 from stokes.geometry import Body
@@ -349,21 +350,27 @@ class Suspension:
         return self._preconditioners[free]
 
     def _make_preconditioner(self, free: bool) -> Preconditioner:
-        alone = BodyPreconditioner(self._surfaces.layout, self._solvers)
-        if self.options.preconditioner == "body":
-            return alone
-        from stokes.schwarz import NeighbourSchwarz
+        """Collective. Bodies alone or close pairs of them; forces between all, if unknown."""
+        surfaces, table = self._surfaces, self._scene.table
+        found: Preconditioner = BodyPreconditioner(surfaces.layout, self._solvers)
+        known = np.empty((0, 2), dtype=np.int64)
+        if self.options.preconditioner == "neighbours":
+            from stokes.schwarz import NeighbourSchwarz
 
-        return NeighbourSchwarz(
-            alone,
-            self._surfaces.layout,
-            self._scene.table,
-            self._solvers,
-            self.formulation,
-            self._cache,
-            self.parallel,
-            free,
-        )
+            found = NeighbourSchwarz(
+                found,
+                surfaces.layout,
+                table,
+                self._solvers,
+                self.formulation,
+                self._cache,
+                self.parallel,
+                free,
+            )
+            known = found.numbers
+        if free or not 1 < table.count <= MOST_BODIES:
+            return found
+        return CoarseForces(found, known, surfaces, self._solvers, table, self.parallel)
 
     def _members(self) -> tuple[Members, dict[int, NDArray]]:
         """Bodies of this rank, and those of other ranks that its nodes are close to."""
