@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from dem_mpi import __version__, shapes
 from dem_mpi.body_file import BodyFile
-from dem_mpi.errors import DataError, DemError, InputError
+from dem_mpi.errors import DataError, DemError, InputError, OutputError
 from dem_mpi.flow_estimate import FlowEstimate, estimate_flow
 from dem_mpi.flow_options import FlowOptions
 from dem_mpi.h5files import OutputLock, agree, require_space
@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 NOT_CONVERGED = DemError.exit_code
 _MARGIN = 1.0  # of a grid or a picture around the bodies, in largest radii
 _PICTURES = (".png", ".pdf", ".svg")
+_COMPILED = 1e-4  # tolerance to which two bodies are solved for to compile kernels
 _LISTED = 12  # bodies whose loads are printed one by one
 _CLOSE = 0.1  # gap in radii from which on neighbours are worth preconditioning with
 _STOKES = 0.1  # Reynolds number up to which the drag of a sphere is Stokes's within 2 %
@@ -71,6 +72,7 @@ def flow_file(
     found.refuse_what_does_not_fit()
     lock = OutputLock(parallel, out)
     try:
+        compile_kernels(parallel, options)
         with agree(parallel, out, "write"):
             if parallel.rank == 0:
                 require_space(out, found.file)
@@ -388,8 +390,10 @@ class Result:
 
         case = self.case
         flow = Flow(self._columns(), self._surfaces(), self._attributes(), self._field())
-        with agree(case.parallel, out, "write"):
+        try:
             write_flow(case.parallel, out, flow, case.share[1])
+        except OSError as error:  # on all ranks
+            raise OutputError(str(error)) from None
 
     def _surfaces(self) -> Surfaces:
         from stokes.flow_file import Surfaces
@@ -488,3 +492,50 @@ def _summary(gid: NDArray, columns: list[tuple[NDArray, str, str]]) -> list[str]
 
 def _vector(values: NDArray) -> str:
     return " ".join(f"{value:11.4e}" for value in values)
+
+
+# ---- compilation ---------------------------------------------------------------------------
+
+
+def compile_kernels(parallel: Parallel, options: FlowOptions) -> None:
+    """Collective. Compile the kernels of a solution on rank 0, then load them on the others.
+
+    Ranks that compiled at the same time would race for numba's cache on disk.
+    """
+    if parallel.size == 1:
+        return
+    # PETSc starts on all ranks together.
+    import petsc4py.PETSc  # noqa: F401
+
+    error = None
+    for turn in (True, False):
+        if (parallel.rank == 0) == turn:
+            try:
+                _solve_two_bodies(options)
+            except Exception as caught:
+                error = caught
+        parallel.raise_together(error)
+
+
+def _solve_two_bodies(options: FlowOptions) -> None:
+    """Solve for a sphere and a spheroid close to it, and look at the flow, on this rank alone."""
+    from stokes.geometry import Body, sphere, spheroid
+    from stokes.suspension import Suspension, SuspensionOptions
+
+    suspension = Suspension(
+        [Body(sphere()), Body(spheroid(1.0, 1.5), centre=(2.05, 0.0, 0.0))],
+        tolerance=max(options.tolerance, _COMPILED),
+        formulation=options.formulation,
+        options=SuspensionOptions(
+            preconditioner="neighbours",
+            threads=options.threads,
+            fmm_tolerance=0.2 * options.tolerance,  # which decides what the sums compute in
+        ),
+    )
+    if options.problem == "resistance":
+        solution = suspension.solve(velocity=(0.0, 0.0, 1.0))
+    else:
+        solution = suspension.solve(force=(0.0, 0.0, 1.0))
+    above = np.array([[0.0, 0.0, 1.1]])
+    solution.velocity(above)
+    solution.pressure(above)

@@ -3,10 +3,12 @@
 Nodes are exact: gaps between bodies and the tolerance decide them, and both are known before any
 work on surfaces. Memory is what matrices of shapes, GMRES's vectors, near corrections and fast sums
 take, with a base for interpreter and libraries. Seconds come from stored costs of one core of an
-AMD EPYC, single precision where the tolerance allows it: within a factor 2 on clusters of 8 to 125
-spheres, gaps 1e-2 and 1, tolerances 1e-3 to 1e-6. Iterations are the least certain part.
+AMD EPYC. Iterations are the least certain part: they grow with closeness and number of the bodies,
+here as for spheres on cubic grids, 8 to 64 of them, moving at random, which is hard; bodies that
+move alike take fewer. In these cases memory came out within 20 %, seconds within a factor 2.
 
-Symbols: n nodes and b bodies of the fullest rank; n_s nodes on a meridian, M modes of a level.
+Symbols: n nodes and b bodies of the fullest rank; n_s nodes on a meridian, M modes of a level; gaps
+g over the smaller body's size, the least of all.
 """
 
 from __future__ import annotations
@@ -27,23 +29,24 @@ if TYPE_CHECKING:
 
 # ---- memory [B] ----------------------------------------------------------------------------
 
-_BASE = 280 << 20  # interpreter, numpy, numba and its code, MPI, PETSc, HDF5
+_BASE = 260 << 20  # interpreter, numpy, numba and its code, MPI, PETSc, HDF5
 _MATRICES = {"single": 2, "combined": 4}  # of a level at one time: assembled, and factored
 _VECTORS = 16  # beside those of GMRES's basis
-_SUM_NODE = {"single": 350, "combined": 800}
-_NEAR_NODE = 1600  # of bodies closer than a tenth of their size
+_SUM_NODE = 800  # for a layer, to three digits; as the 2.5th power of the digits
+_NEAR_NODE = 300  # for a layer at g = 1; as g^-1/2
 _FIELD_POINT = 500
 _DOUBT = 1.5  # estimates this much over what there is are refused
 
 # ---- seconds -------------------------------------------------------------------------------
 
-_ENTRY = 1e-6  # of a modal matrix, assembled; a level has (M + 1) n_s^2 blocks
+_START = 0.3
+_ENTRY = 1e-6  # of a modal matrix, assembled: (M + 1) n_s^2 for a level
 _FLOP = 2e-10  # of factors and of products with them
 _NEAR_PLAN = 2e-5  # a node of close bodies
-_NEAR_APPLY = 4e-6
-_SUM_APPLY = 4e-6  # a node, to three digits
-_START = 1.0
-_CLOSE = 0.1  # gap, in the smaller scale, from which on near corrections count
+_NEAR_APPLY = 2e-6
+_SUM_APPLY = 2.5e-6  # a node, for a layer, to three digits; as the digits
+_CLOSE = 0.5  # g from which on near corrections count
+_FARTHEST = 4.0  # g from which on bodies hardly feel each other
 
 
 @dataclass(frozen=True)
@@ -108,30 +111,27 @@ def estimate_flow(
     own_points = -(-points // parallel.size)
     layers = 2 if options.formulation == "combined" else 1
     digits = -math.log10(report.tolerances.residual)
-    iterations = _iterations(report.least_gap, digits, report.bodies)
-    close = report.least_gap < _CLOSE
+    iterations = _iterations(suspension, digits)
+    gap = min(max(report.least_gap, 1e-3), _FARTHEST)
+    close = gap < _CLOSE
     sizes = np.array(
         [(3 * level.resolution.panels * level.resolution.nodes, level.resolution.modes + 1)
          for level in report.levels]
     )  # fmt: skip
     entries = float((sizes[:, 0] ** 2 * sizes[:, 1]).sum())
+    flops = float((2.0 / 3.0 * sizes[:, 0] ** 3 * sizes[:, 1]).sum())
     basis = min(iterations, suspension.options.restart) + _VECTORS
-    memory = (
-        _BASE
-        + 8 * _MATRICES[options.formulation] * entries
-        + 8 * 3 * n * basis
-        + n * (_SUM_NODE[options.formulation] + close * _NEAR_NODE)
-        + _FIELD_POINT * own_points
-    )
-    per_body = entries * b / len(report.levels)  # of the mean level
+    node = 8 * 3 * basis + layers * (_SUM_NODE * (digits / 3.0) ** 2.5 + _NEAR_NODE / gap**0.5)
+    memory = _BASE + 8 * _MATRICES[options.formulation] * entries + node * n
+    product = layers * n * (_SUM_APPLY * digits / 3.0 + close * _NEAR_APPLY)
+    product += 4.0 * _FLOP * entries * b / len(report.levels)  # with matrices of the mean level
     seconds = (
         _START
         + _ENTRY * layers * entries / 9.0
-        + _FLOP * float((2.0 / 3.0 * sizes[:, 0] ** 3 * sizes[:, 1]).sum())
+        + _FLOP * flops
         + close * _NEAR_PLAN * layers * n
-        + iterations
-        * (layers * n * (_SUM_APPLY * digits / 3.0 + close * _NEAR_APPLY) + 4.0 * _FLOP * per_body)
-        + 2.0 * own_points * _SUM_APPLY * digits / 3.0 * layers
+        + iterations * product
+        + 2.0 * own_points * layers * _SUM_APPLY * digits / 3.0
     )
     return FlowEstimate(
         bodies=report.bodies,
@@ -139,7 +139,7 @@ def estimate_flow(
         levels=len(report.levels),
         points=points,
         iterations=iterations,
-        memory=round(memory),
+        memory=round(memory + _FIELD_POINT * own_points),
         seconds=seconds,
         file=flow_bytes(report.bodies, report.nodes, points),
         ranks=parallel.size,
@@ -147,9 +147,13 @@ def estimate_flow(
     )
 
 
-def _iterations(gap: float, digits: float, bodies: int) -> int:
-    """More where bodies are close; one body alone is inverted exactly."""
-    if bodies == 1:
+def _iterations(suspension: Suspension, digits: float) -> int:
+    """One body alone is inverted exactly; 1.25 b^1/3 g^-1/2 a digit for b bodies."""
+    report = suspension.report
+    if report.bodies == 1:
         return 1
-    near = max(0.0, -math.log10(max(gap, 1e-3)))
-    return math.ceil(digits * (1.0 + near))
+    gap = min(max(report.least_gap, 1e-3), _FARTHEST)
+    each = 1.25 * report.bodies ** (1.0 / 3.0) / gap**0.5
+    if suspension.options.preconditioner == "neighbours":
+        each *= 0.5
+    return min(math.ceil(digits * max(1.0, each)), suspension.options.max_iterations)
