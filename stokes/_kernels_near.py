@@ -23,25 +23,50 @@ _TRUST = 0.9
 
 
 @jit
-def preimage(r, z, node, first, q):
-    """(s0, distance, node's row): where the curve, continued, meets r + i z, near one panel.
+def nearest_node(r, z, node, first, q):
+    """Row of the node nearest to the target among first .. first + q.
 
-    node: rows s, r, z, r', z', r'', z''; the panel's are first .. first + q. The curve is taken to
-    second order about the node nearest to the target; the distance to the panel is estimated so
-    too, and not above that of the node.
+    node: rows s, r, z, r', z', r'', z''.
     """
     best, j = math.inf, first
     for k in range(first, first + q):
         d2 = (r - node[k, 1]) ** 2 + (z - node[k, 2]) ** 2
         if d2 < best:
             best, j = d2, k
+    return j
+
+
+@jit
+def preimage(r, z, node, j):
+    """s0 with gamma(s0) = r + i z of the curve continued to second order about node j."""
     e = complex(r - node[j, 1], z - node[j, 2])
     slope = complex(node[j, 3], node[j, 4])
     bend = 0.5 * complex(node[j, 5], node[j, 6])
     root = cmath.sqrt(slope * slope + 4.0 * bend * e)
     if (root * slope.conjugate()).real < 0.0:
         root = -root
-    return node[j, 0] + 2.0 * e / (slope + root), math.sqrt(best), j
+    return node[j, 0] + 2.0 * e / (slope + root)
+
+
+@jit
+def _nearest_point(r, z, node, j, begin, end):
+    """(distance, radius there) of the panel's point nearest to the target, on the tangent at j."""
+    speed = math.hypot(node[j, 3], node[j, 4])
+    dr, dz = r - node[j, 1], z - node[j, 2]
+    along = (dr * node[j, 3] + dz * node[j, 4]) / speed
+    across = (dz * node[j, 3] - dr * node[j, 4]) / speed
+    foot = min(max(along, speed * (begin - node[j, 0])), speed * (end - node[j, 0]))
+    return math.hypot(across, along - foot), max(node[j, 1] + foot * node[j, 3] / speed, 0.0)
+
+
+@jit
+def _least_xi(r, z, distance, radius, node, first, q):
+    """Least xi over the panel: at its nodes and its nearest point, of this distance, radius."""
+    least = distance * distance / (radius + 1e-300)
+    for k in range(first, first + q):
+        d2 = (r - node[k, 1]) ** 2 + (z - node[k, 2]) ** 2
+        least = min(least, d2 / (node[k, 1] + 1e-300))
+    return 2.0 * math.asinh(0.5 * math.sqrt(least / r)) if r > 0.0 else math.inf
 
 
 @jit_threads
@@ -61,20 +86,13 @@ def needed_refinement(
         h = shape[i]
         q, e = nodes[h], first_edge[h]
         for k in range(first_edge[h + 1] - e - 1):
-            s0, nearest, j = preimage(r[i], z[i], node, first_node[h] + k * q, q)
-            half = 0.5 * (edge[e + k + 1] - edge[e + k])
-            t = (s0 - 0.5 * (edge[e + k + 1] + edge[e + k])) / half
-            speed = math.hypot(node[j, 3], node[j, 4])
-            beyond = max(abs(t.real) - 1.0, 0.0)
-            distance = min(nearest, half * speed * math.hypot(t.imag, beyond))
+            first = first_node[h] + k * q
+            begin, end = edge[e + k], edge[e + k + 1]
+            j = nearest_node(r[i], z[i], node, first, q)
+            distance, radius = _nearest_point(r[i], z[i], node, j, begin, end)
             digits = max(log_tolerance + power * math.log(min(distance, 1.0) + 1e-300), 1.0)
-            radius = node[j, 1] + node[j, 3] * (
-                max(min(t.real, 1.0), -1.0) * half
-                + 0.5 * (edge[e + k + 1] + edge[e + k])
-                - node[j, 0]
-            )
-            p = r[i] * max(radius, node[j, 1])
-            xi = 2.0 * math.asinh(0.5 * distance / math.sqrt(p)) if p > 0.0 else math.inf
+            xi = _least_xi(r[i], z[i], distance, radius, node, first, q)
+            t = (2.0 * preimage(r[i], z[i], node, j) - (begin + end)) / (end - begin)
             w = abs(t + cmath.sqrt(t * t - 1.0))
             rate = abs(math.log(w)) if w > 0.0 else math.inf
             row = out_start[i] + k
@@ -86,8 +104,7 @@ def needed_refinement(
 def preimages(r, z, first, q, node, out):
     """s0 (k,) complex of targets and panels given by their first node."""
     for i in range(len(r)):
-        s0, _, _ = preimage(r[i], z[i], node, first[i], q)
-        out[i] = s0
+        out[i] = preimage(r[i], z[i], node, nearest_node(r[i], z[i], node, first[i], q))
 
 
 @jit

@@ -92,7 +92,7 @@ class PanelBlocks:
         pair = self.pair[members]
         gaps, weights = self._gaps(close.gap[pair, None], close.step[pair, None])
         samples = _Samples.of(shape, self.panel[members], close.s[pair], gaps, weights)
-        rule = _GradedRule.of(shape, samples, self.tolerance / np.abs(samples.weight).max())
+        rule = _GradedRule.of(shape, samples, self._rule_tolerance(samples))
         modes, rows = shape.resolution.modes, self.layers.rows
         most = max(1, _CHUNK_VALUES // ((modes + 1) * rows * 3))
         for chunk in rule.chunks(most):
@@ -107,6 +107,12 @@ class PanelBlocks:
                 kernels.add_to_blocks(
                     *(modal, chunk.weight * factor, chunk.rows, member, self.begin, self.block)
                 )
+
+    def _rule_tolerance(self, samples: _Samples) -> float:
+        """Relative to parts of the panel's potential, which exceed it where these cancel."""
+        gap = min(1.0, np.abs(samples.distance).min(initial=1.0))
+        parts = (0.1, 1.0, 1.0 / gap)[self.layers.order]
+        return 0.01 * self.tolerance / (parts * np.abs(samples.weight).max(initial=1.0))
 
     def _factor(self, layer: ArrayLike) -> Array:
         """Numbers (b,) that turn a layer of unit shapes to the quantity in the world."""
@@ -256,7 +262,7 @@ class _GradedRule:
         pieces = np.empty((total, 2))
         kernels.graded_pieces(samples.s0, begin, end, count, pieces)
         # half of the panel's degree: on pieces shorter than the panel the density is smoother
-        digits = math.log(10.0 / tolerance)
+        digits = -math.log(tolerance)
         x, w = gauss_legendre(math.ceil(0.5 * digits / math.log(kernels.ELLIPSE)) + q // 2)
         length = np.diff(pieces, axis=1)
         s = (pieces[:, :1] + length * x).ravel()

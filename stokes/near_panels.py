@@ -29,22 +29,28 @@ _FACTORS = (1, 2, 3, 4, 6, 8)
 _MOST_REFINED = 16
 # C of the errors C distance^(1 - order) e^{-N xi} of single and double layers: no less was found
 # over random targets, densities and shapes.
-_CONSTANTS = {"velocity": (0.5, 25.0), "pressure": (1.0, 50.0), "stress": (20.0, 400.0)}
+_CONSTANTS = {"velocity": (1.0, 30.0), "pressure": (1.0, 50.0), "stress": (30.0, 1000.0)}
 # Kernels stronger than 1/r are extrapolated to targets this close to a surface, in lengths of the
 # panel below: nearer, cancellation would lose eps/distance.
 _STEP = 1e-3
+# A shape's reach is sought at radii of the body times powers of a step.
+_STEPS, _FARTHEST = 1.1, 40
 
 
 def reach(shape: UnitShape, layers: Layers, tolerance: float) -> float:
-    """Distance from a unit shape beyond which its plain rule meets the tolerance everywhere."""
-    resolution = shape.resolution
-    digits = _digits(layers, tolerance)[0]
-    meridian = shape.meridian
-    across = meridian.r.max() * math.expm1(digits / resolution.angles)
-    ellipse = math.exp(digits / (2.0 * resolution.nodes))
-    lengths = meridian.weights.reshape(resolution.panels, -1).sum(axis=1)
-    along = 0.5 * lengths.max() * 0.5 * (ellipse - 1.0 / ellipse)
-    return max(across, 1.3 * along)
+    """Distance from a unit shape beyond which its plain rule meets the tolerance everywhere.
+
+    Found on the normals at the nodes, from far away inwards.
+    """
+    foot = shape.curve.evaluate(np.concatenate([shape.resolution.breaks, shape.meridian.s]))
+    distances = shape.curve.bounding_radius * _STEPS ** np.arange(_FARTHEST, -_FARTHEST, -1)
+    r = np.maximum(foot.r + distances[:, None] * foot.normal_r, 0.0)
+    z = foot.z + distances[:, None] * foot.normal_z
+    tables, digits = NodeTables.of([shape]), _digits(layers, tolerance)
+    needed, _ = _needed(tables, np.zeros(r.size, np.int64), r.ravel(), z.ravel(), digits, 1)
+    missed = (needed.reshape(len(distances), -1) > 1.0).any(axis=1)
+    first = int(np.argmax(missed)) if missed.any() else len(distances)
+    return float(distances[max(first - 1, 0)]) * _STEPS
 
 
 def _digits(layers: Layers, tolerance: float) -> tuple[float, float]:
@@ -95,7 +101,8 @@ class ClosePanels:
         """Of targets (t, 3) in the world; owner (t,): the body to leave out for each."""
         target, body, r, theta, z = _within_reach(surfaces, targets, layers, tolerance, owner)
         shape = surfaces.shape[body]
-        needed, start = _needed(surfaces, shape, r, z, _digits(layers, tolerance), threads)
+        tables, digits = NodeTables.of(surfaces.shapes), _digits(layers, tolerance)
+        needed, start = _needed(tables, shape, r, z, digits, threads)
         missed = np.flatnonzero(needed.max(axis=1, initial=0.0) > 1.0)
         pair = np.searchsorted(start, missed, side="right") - 1
         by = np.append(_FACTORS, 10**6)[np.searchsorted(_FACTORS, needed[missed])]
@@ -128,7 +135,7 @@ def _within_reach(
 
 
 def _needed(
-    surfaces: Surfaces,
+    tables: NodeTables,
     shape: Index,
     r: Array,
     z: Array,
@@ -136,7 +143,6 @@ def _needed(
     threads: int,
 ) -> tuple[Array, Index]:
     """Refinement (p, 2) needed on all panels for pairs (k,), and the first row of each pair."""
-    tables = NodeTables.of(surfaces.shapes)
     panels = np.diff(tables.first_edge) - 1
     end = np.cumsum(panels[shape])
     start = end - panels[shape]
