@@ -23,8 +23,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stokes.background import BackgroundFlow
+from stokes.evaluate import evaluate
 from stokes.formulation import Formulation, OperatorCache, ShapeSolver
 from stokes.geometry import Body, Meridian, Resolution, SurfaceGrid
+from stokes.layers import Quantity
 from stokes.modes import azimuths
 from stokes.quadrature import gauss_legendre
 from stokes.resolution import resolution_for
@@ -110,6 +112,38 @@ class BodySolution:
             far = self.background.pressure(self.points.reshape(-1, 3), self.viscosity)
             pressure = pressure + far.reshape(pressure.shape)
         return pressure
+
+    def velocity_at(self, points: ArrayLike, tolerance: float = 1e-9) -> Array:
+        """Velocity (m, 3) of the whole flow at points (m, 3) outside, NaN inside.
+
+        tolerance : of the disturbance, see `stokes.evaluate`; on and near the surface the same
+        """
+        velocity = self._evaluated("velocity", points, tolerance)
+        if self.background is not None:
+            velocity += self.background.velocity(np.asarray(points, dtype=np.float64))
+        return velocity
+
+    def pressure_at(self, points: ArrayLike, tolerance: float = 1e-9) -> Array:
+        """Pressure (m,) of the whole flow at points (m, 3), like `velocity_at`."""
+        pressure = self._evaluated("pressure", points, tolerance)
+        if self.background is not None:
+            points = np.asarray(points, dtype=np.float64)
+            pressure += self.background.pressure(points, self.viscosity)
+        return pressure
+
+    def _evaluated(self, quantity: Quantity, points: ArrayLike, tolerance: float) -> Array:
+        layers = self.solver.layers(self.density, self.body.scale, self.viscosity)
+        rho, mu = (None if part is None else part.reshape(-1, 3) for part in layers)
+        return evaluate(
+            [self.body],
+            [self.solver.operators.resolution],
+            points,
+            rho,
+            mu,
+            quantity,
+            self.viscosity,
+            tolerance,
+        )
 
     @cached_property
     def _disturbance_traction(self) -> Array:

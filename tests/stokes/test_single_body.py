@@ -19,6 +19,8 @@ from stokes.exact import (
     jeffery_period,
     point_force_near_sphere,
     slip_velocity,
+    sphere_pressure,
+    sphere_velocity,
     spheroid_resistance,
     stokeslet_velocity,
 )
@@ -515,6 +517,33 @@ def test_flow_inside_is_that_of_point_forces_outside(cache):
     found = flow_of_layers(solver, solver.solve(given), inside)
     exact = flow.velocity(inside)
     assert worst(found - exact, exact) < 1e-12
+
+
+@pytest.mark.parametrize("formulation", EXTERIOR)
+def test_flow_and_pressure_around_a_sphere_are_exact_up_to_its_surface(formulation, cache):
+    body = Body(sphere(), scale=0.5, centre=(1.0, -2.0, 0.3), quaternion=TURNED)
+    velocity, spin, wind = np.array([1.0, 0.2, -0.5]), np.array([0.3, -1.0, 2.0]), (0.0, 0.4, 1.0)
+    solution = solve_resistance(
+        body,
+        velocity,
+        spin,
+        background=UniformFlow(wind),
+        viscosity=3.0,
+        formulation=formulation,
+        resolution=Resolution.uniform(4, 16, 6),
+        cache=cache,
+    )
+    rng = np.random.default_rng(2)
+    x = rng.standard_normal((40, 3))
+    x *= (0.5 + np.geomspace(1e-6, 10.0, 40))[:, None] / np.linalg.norm(x, axis=1)[:, None]
+    relative_motion = velocity - np.array(wind)
+    exact = sphere_velocity(x, 0.5, relative_motion, spin) + wind
+    found = solution.velocity_at(body.centre + x, 1e-10)
+    assert np.abs(found - exact).max() < 1e-9
+    pressure = sphere_pressure(x, 0.5, relative_motion, 3.0)
+    found = solution.pressure_at(body.centre + x, 1e-10)
+    assert np.abs(found - pressure).max() < 1e-9 * pressure.max()
+    assert np.isnan(solution.velocity_at([body.centre])).all()
 
 
 @pytest.mark.parametrize("formulation", EXTERIOR)
