@@ -355,8 +355,9 @@ class Suspension:
         found: Preconditioner = BodyPreconditioner(surfaces.layout, self._solvers)
         known = np.empty((0, 2), dtype=np.int64)
         if self.options.preconditioner == "neighbours":
-            from stokes.schwarz import NeighbourSchwarz
+            from stokes.schwarz import ClosePairs, NeighbourOptions, NeighbourSchwarz
 
+            options = NeighbourOptions()
             found = NeighbourSchwarz(
                 found,
                 surfaces.layout,
@@ -366,8 +367,9 @@ class Suspension:
                 self._cache,
                 self.parallel,
                 free,
+                options,
             )
-            known = found.numbers
+            known = ClosePairs.of(table, options.reach).numbers
         if free or not 1 < table.count <= MOST_BODIES:
             return found
         return CoarseForces(found, known, surfaces, self._solvers, table, self.parallel)
