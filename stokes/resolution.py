@@ -25,13 +25,14 @@ from stokes.curves import Curve, CurvePoints, resolved_breaks
 Array = NDArray[np.float64]
 
 # Least gaps a level serves, as parts of the bounding radius: (at a pole, anywhere else).
-_LADDER = ((1.0, 1.0), (0.1, 0.3), (0.1, 0.1), (1e-3, 0.1), (0.03, 0.03), (1e-3, 0.01))
+_LADDER = ((1.0, 1.0), (0.1, 0.3), (0.1, 0.1), (1e-3, 0.5), (1e-3, 0.1), (1e-3, 0.01))
 _LEAST_MODES = 4  # rigid motions and quadratic flows: 0 .. 2
 _POLAR = 0.1  # contacts off the axis by up to this part of the image's distance count as polar
 _SLACK = 0.99  # gaps this near to those of a level are served by it
 # Part of the density that the nearest image carries. Two moving spheroids at a gap of a tenth
 # then err, in the middle of the gap, by 2 to 10 tolerances; their forces by less than 0.1.
 _SHARE = 0.1
+_POLAR_SHARE = 10.0  # at a pole, where few panels buy it: pressures between approaching bodies
 
 
 @dataclass(frozen=True)
@@ -123,7 +124,8 @@ class ResolutionLadder:
     def _level(self, pole: float, side: float) -> Resolution:
         pole, side = pole * self.curve.bounding_radius, side * self.curve.bounding_radius
         nodes = panel_nodes(self.tolerance)
-        least = (self.tolerance / _SHARE) ** (-1 / nodes) if self.tolerance < _SHARE else 1.0
+        least = max(1.0, (self.tolerance / _SHARE) ** (-1 / nodes))
+        polar_least = max(1.0, (self.tolerance / _POLAR_SHARE) ** (-1 / nodes))
         ends = np.array([0.0, 1.0])
         images = ends + 1j * _image_parameter(self.curve.evaluate(ends), pole)
         edges = resolved_breaks(self.curve, _shape_functions, nodes, self.tolerance)
@@ -134,7 +136,7 @@ class ResolutionLadder:
             # An image over the middle of a panel is the worst.
             eta = _image_parameter(points, side).min(axis=1) / half
             polar = _bernstein((images - middle[:, None]) / half[:, None]).min(axis=1)
-            coarse = np.minimum(eta + np.hypot(1, eta), polar) < least
+            coarse = (eta + np.hypot(1, eta) < least) | (polar < polar_least)
             done.append(pending[~coarse])
             (a, b), m = pending[coarse].T, middle[coarse]
             pending = np.concatenate([np.column_stack([a, m]), np.column_stack([m, b])])

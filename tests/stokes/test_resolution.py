@@ -67,7 +67,7 @@ def test_bodies_take_the_coarsest_level_that_serves_their_neighbours():
     polar = ladder.resolution([0.01], [0.0])
     equatorial = ladder.resolution([0.01], [0.5])
     assert polar.modes < equatorial.modes
-    assert polar == ladder.resolution([0.01, 0.2], [1.0, 0.5])
+    assert polar == ladder.resolution([0.01, 0.6], [1.0, 0.5])
     assert ladder.level([0.01, 0.01], [0.0, 0.5]) == ladder.level([0.01], [0.5])
     with pytest.raises(ValueError, match=r"no level for the gap 0.0005 at s = 0"):
         ladder.level([0.5, 5e-4], [0.5, 0.0])
