@@ -44,8 +44,9 @@ _REQUIRED = ("position", "gid", "radius")
 _OF_OTHER_SHAPES = ("shape", "half_length", "orientation")
 _MOTION = ("velocity", "angular_velocity")
 
-# What `auto` leaves between bodies, in radii of the smaller one (its least half width).
-LEAST_GAP = 1e-2
+# Gaps are counted in radii of the smaller body: of a rod's caps, of a spheroid's equator.
+LEAST_GAP = 1e-2  # that `auto` leaves between bodies
+SMALLEST_GAP = 1e-3  # that there is a solution for
 _SMALLEST_FACTOR = 0.1  # bodies that overlap so deeply are no bodies of a packing
 _FACTOR_ERROR = 1e-9  # of a factor found by bisection
 _RATIO_DIGITS = 12  # bodies whose aspect ratios agree so far have one curve
@@ -403,18 +404,18 @@ def shrinkage(bodies: FrameBodies, factor: float | None = None) -> Shrinkage:
     """The largest factor <= 1 that leaves `LEAST_GAP` between all bodies, or the one that is given.
 
     Exact for spheres; for other bodies by bisection with `stokes.distance`, to 1e-9 and from
-    below. Raises InputError where bodies touch at the factor that is given, or overlap so much
-    that next to nothing would be left of them.
+    below. Raises InputError where bodies are nearer than `SMALLEST_GAP` at the factor that is
+    given, or overlap so much that next to nothing would be left of them.
     """
     pairs = _near_pairs(bodies)
     if factor is not None:
         found = _least(bodies, pairs, factor)
-        if found.gap <= 0.0:
-            best = shrinkage(bodies).factor
+        if found.gap < SMALLEST_GAP:
+            near = f"are {found.gap:.2g} radii apart" if found.gap > 0.0 else "touch or overlap"
             raise InputError(
                 f"--hydrodynamic-radius {factor:g}: bodies {found.pair[0]} and {found.pair[1]} "
-                f"{'touch' if found.gap == 0.0 else 'overlap'}, which has no solution; "
-                f"auto takes {best:.6g}"
+                f"{near}, at least {SMALLEST_GAP:g} is needed; auto takes "
+                f"{shrinkage(bodies).factor:.6g}"
             )
         return found
     if not bodies.shape.any():
@@ -446,9 +447,8 @@ def _near_pairs(bodies: FrameBodies) -> NDArray:
 
 
 def _pair_size(bodies: FrameBodies, pairs: NDArray) -> NDArray:
-    """What a gap is counted in, (k,) [m]: the lesser half width of the two bodies."""
-    size = shapes.smallest_size(bodies.shape, bodies.radius, bodies.half_length)
-    return size[pairs].min(axis=1)
+    """What a gap is counted in, (k,) [m]: the lesser radius of the two bodies."""
+    return bodies.radius[pairs].min(axis=1)
 
 
 def _distance(bodies: FrameBodies, pairs: NDArray) -> NDArray:

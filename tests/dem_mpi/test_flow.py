@@ -288,13 +288,13 @@ def test_a_file_that_exists_is_replaced_only_by_force(pile, tmp_path):
 
 
 def test_bodies_that_touch_at_the_size_that_is_given_are_refused(pile, tmp_path):
-    with pytest.raises(InputError, match=r"bodies 0 and 1 overlap"):
+    with pytest.raises(InputError, match=r"bodies 0 and 1 touch or overlap"):
         flow_of(pile, out=tmp_path / "flow.h5", hydrodynamic_radius="1")
 
 
 def test_a_gap_that_is_too_small_is_refused_with_both_bodies(tmp_path):
     columns = columns_of([[0, 0, 0], [0.20001, 0, 0]], 0.1, velocity=(1.0, 0, 0))
-    with pytest.raises(InputError, match="gap"):
+    with pytest.raises(InputError, match=r"bodies 0 and 1 are 0\.0001 radii apart"):
         flow_of(write_run(tmp_path / "run.h5", columns), hydrodynamic_radius="1")
 
 
@@ -385,7 +385,7 @@ def test_every_number_of_ranks_answers_alike(pile, tmp_path):
         (["run.h5", "--bodies", "77"], 64, "--bodies 77: no such body"),
         (["none.h5"], 64, "none.h5: no such file"),
         (["damaged.h5"], 65, "checksum of 'radius' does not match"),
-        (["run.h5", "--hydrodynamic-radius", "1"], 64, "overlap"),
+        (["run.h5", "--hydrodynamic-radius", "1"], 64, "touch or overlap"),
         (["run.h5", "--background", "storm:1"], 64, "--background 'storm:1'"),
     ],
 )

@@ -302,8 +302,12 @@ def test_a_factor_that_is_given_is_taken_or_refused_with_a_better_one(tmp_path):
     assert shrinkage(bodies, 0.9).gap == pytest.approx((1.999 - 1.8) / 0.9, rel=1e-12)
     with pytest.raises(InputError) as caught:
         shrinkage(bodies, 1.0)
-    for words in ("--hydrodynamic-radius 1", "bodies 0 and 1 overlap", "auto takes 0.994527"):
+    for words in ("--hydrodynamic-radius 1", "0 and 1 touch or overlap", "auto takes 0.994527"):
         assert words in str(caught.value)
+    with pytest.raises(
+        InputError, match=r"bodies 0 and 1 are 0\.0005 radii apart, at least 0\.001"
+    ):
+        shrinkage(bodies, 1.999 / 2.0005)
 
 
 def test_bodies_at_one_place_are_refused(tmp_path):
@@ -314,30 +318,28 @@ def test_bodies_at_one_place_are_refused(tmp_path):
 
 # Exact factors of two equal bodies, the second 0.15 m away along x from the first, whose axis is z
 # unless it is turned: the gap along x is 0.15 - f w, w the sum of half widths, and shall be
-# 0.01 f s with s the lesser half width.
+# 0.01 f 0.1, for the radius of both is 0.1.
 TURNED = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)  # the axis along x
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
-    ("shape", "half_length", "orientation", "width", "size"),
+    ("shape", "half_length", "orientation", "width"),
     [
-        ("spheroid", 0.2, (UPRIGHT, UPRIGHT), 0.2, 0.1),
-        ("spheroid", 0.05, (TURNED, TURNED), 0.1, 0.05),
-        ("spheroid", 0.02, (TURNED, UPRIGHT), 0.12, 0.02),
-        ("spherocylinder", 0.3, (UPRIGHT, UPRIGHT), 0.2, 0.1),
-        ("spherocylinder", 0.08, (UPRIGHT, TURNED), 0.28, 0.1),
+        ("spheroid", 0.2, (UPRIGHT, UPRIGHT), 0.2),
+        ("spheroid", 0.05, (TURNED, TURNED), 0.1),
+        ("spheroid", 0.02, (TURNED, UPRIGHT), 0.12),
+        ("spherocylinder", 0.3, (UPRIGHT, UPRIGHT), 0.2),
+        ("spherocylinder", 0.08, (UPRIGHT, TURNED), 0.28),
     ],
 )
-def test_other_shapes_shrink_to_the_same_gap(
-    tmp_path, shape, half_length, orientation, width, size
-):
+def test_other_shapes_shrink_to_the_same_gap(tmp_path, shape, half_length, orientation, width):
     columns = columns_of(
         [[0, 0, 0], [0.15, 0, 0], [5, 5, 5]], 0.1, shape, half_length, (*orientation, UPRIGHT)
     )
     bodies = handed(tmp_path, columns)
     found = shrinkage(bodies)
-    expected = min(1.0, 0.15 / (width + LEAST_GAP * size))
+    expected = min(1.0, 0.15 / (width + LEAST_GAP * 0.1))
     # Gaps are found to about 1e-10 of a size, the factor to 1e-9.
     assert found.factor == pytest.approx(expected, rel=1e-8)
     if expected < 1.0:
