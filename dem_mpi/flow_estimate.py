@@ -93,7 +93,8 @@ class FlowEstimate:
             raise InputError(
                 f"{self.nodes:,} nodes would take about {readable_size(self.memory)} a rank, and "
                 f"this machine has {readable_size(self.share)}: take fewer bodies (--bodies, "
-                "--region), a looser --tolerance, a coarser --grid, or more machines"
+                "--region), wider gaps (a smaller --hydrodynamic-radius), a looser --tolerance, a "
+                "coarser --grid, or more machines"
             )
 
 
