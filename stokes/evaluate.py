@@ -9,7 +9,7 @@ added by `stokes.near`. On a surface the values are the limits from outside.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,6 +29,8 @@ Index = NDArray[np.int64]
 
 # Points of which blocks of the near field are held at once.
 _CHUNK = 20_000
+# Pairs of a node and a point on a rank that are summed sooner than a fast method is planned.
+_FEW_PAIRS = 1e9
 # Points this much inside a unit shape, and round-off of world coordinates, still count as on it.
 _INSIDE = 1e-12
 # Where a sum's term of the nearest node loses digits by round-off, values are extrapolated along
@@ -169,6 +171,9 @@ class _Flow:
     ) -> Array:
         """Collective. Sums over the plain rules of all bodies."""
         values = np.zeros((len(points), self.layers.rows))
+        pairs = parallel.sum(self.own.nodes) * parallel.sum(len(points))
+        if options.backend == "own" and pairs < _FEW_PAIRS * parallel.size:
+            options = replace(options, backend="direct")
         sources = self.own.sources()
         kernels = LAYER_KERNELS[self.layers.quantity]
         maps = (sources.single_weights, sources.double_weights)

@@ -52,7 +52,16 @@ def _stresslet_stress(x, y, z, w):
     )
 
 
-stresslet_stress = Kernel("stresslet_stress", _stresslet_stress, 6, 6, degree=-3.0, parity=1)
+# Both sides are symmetric tensors, and the kernel is symmetric between them.
+_PAIRS = tuple(tuple((min(i, j), max(i, j)) for j in range(6)) for i in range(6))
+_NUMBER = {pair: n for n, pair in enumerate(sorted(set(sum(_PAIRS, ()))))}
+
+stresslet_stress = Kernel(
+    *("stresslet_stress", _stresslet_stress, 6, 6),
+    degree=-3.0,
+    parity=1,
+    entry=tuple(tuple(_NUMBER[pair] for pair in row) for row in _PAIRS),
+)
 
 #: (single layer's kernel, double layer's kernel) of every quantity.
 LAYER_KERNELS = {
