@@ -11,8 +11,9 @@ enough from their places (J. Rotne, S. Prager, J. Chem. Phys. 50, 4831, 1969, fo
 
     M_ij = 1/(8 pi r) ((1 + s/(3 r^2)) 1 + (1 - s/r^2) e e^T),   s = a_i^2 + a_j^2,   M_ii = R_i^-1.
 
-With N what of M the inner preconditioner knows already, the residual that it is given is r with U
-replaced by N M^-1 U.
+With N what of M the inner preconditioner knows already, its answer to r is changed by what every
+body alone makes of the velocity N M^-1 U - U. (Not by what the inner preconditioner makes of it:
+bodies in touch then seem to approach each other, where they are carried by one smooth flow.)
 
 Symbols: B bodies of all ranks, b of this one; viscosity 1; a_i radius of the sphere with the drag.
 """
@@ -57,25 +58,28 @@ class CoarseForces:
         self._parallel = parallel
         self._rows = table.own[surfaces.layout.order]
         self._count = table.count
+        self._responses = {
+            group.shape: solvers[group.shape].solve(solvers[group.shape].rigid_motions[..., :3])
+            for group in surfaces.layout.groups
+        }
         resistance = self._gathered(self._resistances())
         pairs = np.zeros((table.count, table.count), dtype=np.int64)
         pairs[known[:, 0], known[:, 1]] = 1
         pairs = parallel.max(np.maximum(pairs, pairs.T)).astype(bool)
         mobility = _mobility(table.centre, resistance)
-        self._factors = lu_factor(_flat(mobility))
-        mobility[~(pairs | np.eye(table.count, dtype=bool))] = 0.0
-        self._known = _flat(mobility)[self._components(self._rows)]
+        answered = _flat(mobility) @ _flat(_pair_forces(mobility, resistance, pairs))
+        self._factors = lu_factor(answered)
         self.flexible = inner.flexible
-        self.nbytes = inner.nbytes + self._factors[0].nbytes + self._known.nbytes
+        self.nbytes = inner.nbytes + self._factors[0].nbytes
 
     def apply(self, residual: Field) -> Field:
         """Collective. Approximate densities of residual velocities."""
         if residual.rigid is not None:
             raise ValueError("loads are given: forces between bodies are known")
         given = self._motions(residual.nodal)
-        every = self._gathered(given).ravel()
-        wanted = (self._known @ lu_solve(self._factors, every)).reshape(-1, 3)
-        change = np.einsum("bji,bj->bi", self._surfaces.rotation, wanted - given)
+        wanted = lu_solve(self._factors, self._gathered(given).ravel()).reshape(-1, 3)
+        change = wanted[self._rows] - given
+        change = np.einsum("bji,bj->bi", self._surfaces.rotation, change)
         return self._inner.apply(Field(residual.nodal + self._surfaces.per_body(change)))
 
     def _motions(self, velocity: NDArray) -> NDArray:
@@ -104,10 +108,6 @@ class CoarseForces:
         self._parallel.sum_in_place(every)
         return every
 
-    @staticmethod
-    def _components(rows: NDArray) -> NDArray:
-        return (3 * rows[:, None] + np.arange(3)).ravel()
-
 
 def _mobility(centre: NDArray, resistance: NDArray) -> NDArray:
     """M (B, B, 3, 3) of the head of this module."""
@@ -123,6 +123,24 @@ def _mobility(centre: NDArray, resistance: NDArray) -> NDArray:
     mobility /= (8.0 * math.pi * distance)[:, :, None, None]
     mobility[range(count), range(count)] = np.linalg.inv(resistance)
     return mobility
+
+
+def _pair_forces(mobility: NDArray, resistance: NDArray, pairs: NDArray) -> NDArray:
+    """Forces (B, B, 3, 3) of given velocities, of bodies alone and what pairs add to that."""
+    count = len(resistance)
+    forces = np.zeros_like(mobility)
+    forces[range(count), range(count)] = resistance
+    first, second = np.nonzero(np.triu(pairs, 1))
+    both = np.empty((len(first), 2, 3, 2, 3))
+    for a, i in enumerate((first, second)):
+        for b, j in enumerate((first, second)):
+            both[:, a, :, b] = mobility[i, j]
+    both = np.linalg.inv(both.reshape(-1, 6, 6)).reshape(both.shape)
+    for a, i in enumerate((first, second)):
+        both[:, a, :, a] -= resistance[i]
+        for b, j in enumerate((first, second)):
+            np.add.at(forces, (i, j), both[:, a, :, b])
+    return forces
 
 
 def _flat(blocks: NDArray) -> NDArray:
