@@ -15,6 +15,7 @@ from stokes.geometry import Body, Meridian, Resolution, SurfaceGrid, sphere, sph
 from layer_sums import PointForces, on_grid
 
 RESOLUTION = Resolution.uniform(8, 16, 30)
+COARSE = Resolution.uniform(5, 12, 16)
 CURVE = spheroid(0.6, 1.0)
 VISCOSITY = 2.5
 QUANTITIES = ("velocity", "pressure", "stress")
@@ -24,13 +25,13 @@ GAPS = (1.0, 0.1, 1e-2, 1e-3, 1e-6, 0.0)
 class ForcesInBody:
     """Green's representation of point forces inside a spheroid of some place, size and turn."""
 
-    def __init__(self, seed, scale=1.7, centre=(3.0, -1.0, 0.5)):
+    def __init__(self, seed, scale=1.7, centre=(3.0, -1.0, 0.5), resolution=RESOLUTION):
         generator = np.random.default_rng(seed)
         self.body = Body(CURVE, scale, centre, tuple(generator.normal(size=4)))
         self.flow = PointForces(
             self.body.to_world(0.1 * generator.normal(size=(3, 3))), generator.normal(size=(3, 3))
         )
-        grid = SurfaceGrid(Meridian(CURVE, RESOLUTION))
+        grid = SurfaceGrid(Meridian(CURVE, resolution))
         turned = _Turned(self.flow, self.body)
         velocity, traction = on_grid(grid, turned)
         self.single = -traction.reshape(-1, 3)
@@ -198,7 +199,7 @@ def test_requests_that_make_no_sense_are_refused():
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_ranks_share_bodies_and_points(parallel, quantity):
     """Bodies go round the ranks, points are cut evenly: neighbours' densities cross ranks."""
-    cases = [ForcesInBody(k, 0.5, (1.1 * k, 0.0, 0.0)) for k in range(4)]
+    cases = [ForcesInBody(k, 0.5, (1.1 * k, 0.0, 0.0), COARSE) for k in range(4)]
     mine = cases[parallel.rank :: parallel.size]
     generator = np.random.default_rng(1)
     points = np.concatenate([case.points(np.repeat(GAPS, 3), generator) for case in cases])
@@ -210,34 +211,35 @@ def test_ranks_share_bodies_and_points(parallel, quantity):
     nothing = np.empty((0, 3))
     found = evaluate(
         [case.body for case in mine],
-        [RESOLUTION] * len(mine),
+        [COARSE] * len(mine),
         points[part],
         np.concatenate([nothing, *(case.single for case in mine)]),
         np.concatenate([nothing, *(case.double for case in mine)]),
         quantity,
         VISCOSITY,
-        tolerance=1e-7,
+        tolerance=1e-5,
         parallel=parallel,
     )
     unit = sum(case.unit(quantity) for case in cases)
-    assert np.abs(found - exact[part]).max(initial=0.0) < 1e-7 * unit
+    assert np.abs(found - exact[part]).max(initial=0.0) < 1e-5 * unit
 
 
 @pytest.mark.mpi(ranks=[2, 3])
 def test_one_rank_may_have_all_bodies_and_another_all_points(parallel):
-    case = ForcesInBody(1)
+    case = ForcesInBody(1, resolution=COARSE)
     mine = parallel.rank == 0
     points = case.points(np.array([0.0, 1e-3, 0.1, 1.0]), np.random.default_rng(0))
     asked = points if parallel.rank == parallel.size - 1 else np.empty((0, 3))
     found = evaluate(
         [case.body] if mine else [],
-        [RESOLUTION] if mine else [],
+        [COARSE] if mine else [],
         asked,
         case.single if mine else np.empty((0, 3)),
         case.double if mine else np.empty((0, 3)),
         viscosity=VISCOSITY,
+        tolerance=1e-5,
         parallel=parallel,
     )
     assert found.shape == asked.shape
     exact = case.exact("velocity", asked)
-    assert np.abs(found - exact).max(initial=0.0) < 1e-6 * case.unit("velocity")
+    assert np.abs(found - exact).max(initial=0.0) < 1e-5 * case.unit("velocity")
