@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 NOT_CONVERGED = DemError.exit_code
 _MARGIN = 1.0  # of a grid or a picture around the bodies, in largest radii
 _PICTURES = (".png", ".pdf", ".svg")
-_COMPILED = 1e-4  # tolerance to which two bodies are solved for to compile kernels
+_COMPILED = 1e-3  # tolerance to which two bodies are solved for to compile kernels
 _LISTED = 12  # bodies whose loads are printed one by one
 _CLOSE = 0.1  # gap in radii from which on neighbours are worth preconditioning with
 _STOKES = 0.1  # Reynolds number up to which the drag of a sphere is Stokes's within 2 %
@@ -523,7 +523,7 @@ def _solve_two_bodies(options: FlowOptions) -> None:
     from stokes.suspension import Suspension, SuspensionOptions
 
     suspension = Suspension(
-        [Body(sphere()), Body(spheroid(1.0, 1.5), centre=(2.05, 0.0, 0.0))],
+        [Body(sphere()), Body(spheroid(1.0, 1.5), centre=(2.2, 0.0, 0.0))],
         tolerance=max(options.tolerance, _COMPILED),
         formulation=options.formulation,
         options=SuspensionOptions(
