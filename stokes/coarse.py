@@ -67,20 +67,25 @@ class CoarseForces:
         pairs[known[:, 0], known[:, 1]] = 1
         pairs = parallel.max(np.maximum(pairs, pairs.T)).astype(bool)
         mobility = _mobility(table.centre, resistance)
-        answered = _flat(mobility) @ _flat(_pair_forces(mobility, resistance, pairs))
-        self._factors = lu_factor(answered)
+        self._factors = lu_factor(_flat(mobility))
+        mobility[~(pairs | np.eye(table.count, dtype=bool))] = 0.0
+        self._known = _flat(mobility)[(3 * self._rows[:, None] + np.arange(3)).ravel()]
         self.flexible = inner.flexible
-        self.nbytes = inner.nbytes + self._factors[0].nbytes
+        self.nbytes = inner.nbytes + self._factors[0].nbytes + self._known.nbytes
 
     def apply(self, residual: Field) -> Field:
         """Collective. Approximate densities of residual velocities."""
         if residual.rigid is not None:
             raise ValueError("loads are given: forces between bodies are known")
+        density = self._inner.apply(residual).nodal
         given = self._motions(residual.nodal)
-        wanted = lu_solve(self._factors, self._gathered(given).ravel()).reshape(-1, 3)
-        change = wanted[self._rows] - given
-        change = np.einsum("bji,bj->bi", self._surfaces.rotation, change)
-        return self._inner.apply(Field(residual.nodal + self._surfaces.per_body(change)))
+        forces = lu_solve(self._factors, self._gathered(given).ravel())
+        wanted = (self._known @ forces).reshape(-1, 3)
+        change = np.einsum("bji,bj->bi", self._surfaces.rotation, wanted - given)
+        for group in self._surfaces.layout.groups:
+            moved = self._responses[group.shape] @ change[group.bodies].T
+            group.view(density)[...] += np.moveaxis(moved, -1, 0)
+        return Field(density)
 
     def _motions(self, velocity: NDArray) -> NDArray:
         """Velocities (b, 3) in the world of this rank's bodies, each free and alone."""
@@ -123,24 +128,6 @@ def _mobility(centre: NDArray, resistance: NDArray) -> NDArray:
     mobility /= (8.0 * math.pi * distance)[:, :, None, None]
     mobility[range(count), range(count)] = np.linalg.inv(resistance)
     return mobility
-
-
-def _pair_forces(mobility: NDArray, resistance: NDArray, pairs: NDArray) -> NDArray:
-    """Forces (B, B, 3, 3) of given velocities, of bodies alone and what pairs add to that."""
-    count = len(resistance)
-    forces = np.zeros_like(mobility)
-    forces[range(count), range(count)] = resistance
-    first, second = np.nonzero(np.triu(pairs, 1))
-    both = np.empty((len(first), 2, 3, 2, 3))
-    for a, i in enumerate((first, second)):
-        for b, j in enumerate((first, second)):
-            both[:, a, :, b] = mobility[i, j]
-    both = np.linalg.inv(both.reshape(-1, 6, 6)).reshape(both.shape)
-    for a, i in enumerate((first, second)):
-        both[:, a, :, a] -= resistance[i]
-        for b, j in enumerate((first, second)):
-            np.add.at(forces, (i, j), both[:, a, :, b])
-    return forces
 
 
 def _flat(blocks: NDArray) -> NDArray:
