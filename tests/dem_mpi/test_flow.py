@@ -23,7 +23,7 @@ from stokes.flow_file import Flow, read_flow
 
 from flow_runs import DENSITIES, columns_of, touching_pile, write_run
 from launch import ROOT, run_ranks
-from runs import messages
+from runs import LEAVING, messages, simulate
 
 TOLERANCE = 1e-4
 VISCOSITY = 1.3
@@ -452,6 +452,24 @@ def test_every_flag_is_on_the_page_and_no_other():
     )  # fmt: skip
     flags = set(re.findall(r"--[a-z][a-z-]+", done.stdout.split("Exit codes")[0])) - {"--help"}
     assert set(re.findall(r"--[a-z][a-z-]+", PAGE)) == flags
+
+
+def test_a_run_as_it_is_goes_through(tmp_path):
+    simulate(Parallel.alone(), LEAVING, tmp_path, "time.end=0.02")
+    path = tmp_path / "run.h5"
+    code, said, flow = flow_of(path, bodies="0 7 49", tolerance=1e-2, hydrodynamic_radius="0.5")
+    assert code == 0 and "3 of 50 bodies: 3 spheres" in said[0]
+    with h5py.File(path) as file:
+        last = slice(int(file["frames/offset"][-1]), None)
+        rows = np.isin(file["gid"][last], [0, 7, 49])
+        order = np.argsort(file["gid"][last][rows])
+        np.testing.assert_array_equal(flow.bodies["position"], file["position"][last][rows][order])
+        velocity = file["velocity"][last][rows][order]
+        radius = file["radius"][last][rows][order]
+    np.testing.assert_allclose(flow.bodies["velocity"], velocity, rtol=1e-12)
+    # Far apart, for half their size: each has about its own drag.
+    alone = -6.0 * np.pi * VISCOSITY * 0.5 * radius[:, None] * velocity
+    np.testing.assert_allclose(flow.bodies["force"], alone, atol=0.2 * np.abs(alone).max())
 
 
 def test_info_says_what_is_in_a_flow_file(pile, tmp_path):
