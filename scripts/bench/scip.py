@@ -17,7 +17,8 @@ Parts, in the order of their worth:
 
 A measurement is a run of its own, kept under build/bench/scip by state, method, ranks and version
 of dem_mpi: a long set can be done in pieces (--only), what is there is not measured again, and
-records are made of all that is there. --version VERSION takes what another version measured.
+records are made of all that is there. --version VERSION ... takes what other versions measured,
+the first of them where it is known.
 --dry measures nothing; --quick is a set of its own, piles
 of 500 and 2,000 spheres alone. --states makes states (or names them all) and ends. --page puts
 the tables between the markers of a Markdown file.
@@ -231,11 +232,12 @@ def run_task(task: dict[str, Any], ranks: int, limit: float) -> dict[str, Any]:
 
 
 def gather(
-    chosen: list[Piece], parts: tuple[str, ...], version: str
+    chosen: list[Piece], parts: tuple[str, ...], versions: list[str]
 ) -> list[tuple[Piece, dict[str, Any]]]:
     """What is known of each piece; those of `parts` that are not known are measured."""
     known = []
     for piece in chosen:
+        version = next((v for v in versions if piece.path(v).exists()), versions[0])
         path = piece.path(version)
         if not path.exists() and piece.part in parts:
             print(f"{piece.part}: {piece.state}, {piece.method}, {piece.ranks} ranks", flush=True)
@@ -250,7 +252,7 @@ def gather(
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps(found | {"wall": wall}, indent=1))
         if path.exists():
-            known.append((piece, json.loads(path.read_text())))
+            known.append((piece, json.loads(path.read_text()) | {"version": version}))
     return known
 
 
@@ -272,10 +274,14 @@ def records_of(known: Known) -> list[Record]:
         }
         if found.get("failure"):
             params["failure"] = found["failure"]
-            records.append(Record("scip.failure", params, 1, "1", ranks=piece.ranks))
+            failed = Record("scip.failure", params, 1, "1", ranks=piece.ranks)
+            records.append(replace(failed, commit=found["version"]))
         for row in found["rows"]:
-            records += _row_records(piece, row, params)
-    return records + headlines(known) + growth(known) + crossings(known)
+            both = _row_records(piece, row, params)
+            records += [replace(record, commit=found["version"]) for record in both]
+    drawn = headlines(known) + growth(known) + crossings(known)
+    version = next((found["version"] for piece, found in known if piece.part == "piles"), None)
+    return records + [replace(r, commit=version or checked_out()) for r in drawn]
 
 
 def _row_records(piece: Piece, row: dict[str, Any], params: dict[str, Any]) -> list[Record]:
@@ -426,7 +432,7 @@ def seconds_to(
 # ---- tables --------------------------------------------------------------------------------
 
 
-def tables(known: Known, records: list[Record], version: str) -> str:
+def tables(known: Known, records: list[Record]) -> str:
     """The tables of the page, in Markdown."""
     blocks = [
         _pile_table(known),
@@ -435,7 +441,11 @@ def tables(known: Known, records: list[Record], version: str) -> str:
         *(_precision_table(known, state) for state in _states(known, ("precision", "deep"))),
         *(_coulomb_table(known, state) for state in _states(known, ("coulomb",))),
     ]
-    note = f"Commit {version}."
+    parts = {piece.part: found["version"] for piece, found in known}
+    usual, *others = dict.fromkeys(parts.values())
+    note = f"Commit {usual}."
+    for version in others:
+        note += f" Of {version}: {', '.join(p for p, v in parts.items() if v == version)}."
     return "\n\n".join([note, *(block for block in blocks if block)])
 
 
@@ -647,7 +657,8 @@ def main() -> None:
     parser = arguments(__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="+", choices=PARTS, help="measure these parts alone")
     parser.add_argument("--dry", action="store_true", help="measure nothing, use what is known")
-    parser.add_argument("--version", help="as which version of dem_mpi results are kept and found")
+    found = "as which version of dem_mpi results are kept; as which ones they are found"
+    parser.add_argument("--version", nargs="+", metavar="VERSION", help=found)
     parser.add_argument("--page", type=Path, help="put the tables into this Markdown file")
     parser.add_argument("--states", nargs="*", metavar="NAME", help="make these states and end")
     options = parser.parse_args()
@@ -657,12 +668,12 @@ def main() -> None:
             print(name, piles.make(name) if options.states else piles.directory(recipe))
         return
     parts = options.only or (QUICK_PARTS if options.quick else PARTS)
-    version = options.version or checked_out()
-    known = gather(pieces(options.quick), () if options.dry else tuple(parts), version)
-    records = [replace(record, commit=version) for record in records_of(known)]
+    versions = options.version or [checked_out()]
+    known = gather(pieces(options.quick), () if options.dry else tuple(parts), versions)
+    records = records_of(known)
     write(records, options.json)
     if options.page:
-        put("tables", tables(known, records, version), options.page)
+        put("tables", tables(known, records), options.page)
     if options.figure:
         draw(known, options.figure)
 
