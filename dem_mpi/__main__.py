@@ -423,7 +423,7 @@ def flow(
         typer.Option(
             "--slice",
             metavar="x|y|z[=PLACE]",
-            help="Plane of the picture, across an axis; without a place through the middle.",
+            help="Plane of the picture, across an axis; without a place where it cuts most bodies.",
         ),
     ] = "y",
     dry_run: Annotated[

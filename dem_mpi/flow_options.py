@@ -34,7 +34,7 @@ class FlowOptions:
                    None stands around the bodies
     points       : file of points in place of a grid
     out, force   : file to write, and whether it may be replaced
-    picture      : file to draw; plane: axis it is across, and where [m], None: through the middle
+    picture      : file to draw; plane: axis it is across, and where [m], None: through most bodies
     """
 
     frame: str = "last"

@@ -46,7 +46,7 @@ class Plane:
         longest: int = 120,
         margin: float = 1.0,
     ) -> Plane:
-        """A plane across `axis`, by default through the middle of the bodies, with all of them.
+        """A plane across `axis` as large as all bodies, by default where it cuts most of them.
 
         longest : points along the longer side; margin : room around the bodies, in largest radii
         """
@@ -55,7 +55,7 @@ class Plane:
         low = (centre - radius[:, None]).min(axis=0) - margin * radius.max()
         high = (centre + radius[:, None]).max(axis=0) + margin * radius.max()
         if place is None:
-            place = float(0.5 * (low[axis] + high[axis]))
+            place = _busiest(centre[:, axis], radius)
         across = [k for k in range(3) if k != axis]
         side = (high - low)[across]
         counts = tuple(max(2, round(longest * part)) for part in side / side.max())
@@ -81,6 +81,15 @@ class Plane:
         points = np.full((right.size, 3), self.place)
         points[:, self.across[0]], points[:, self.across[1]] = right.ravel(), up.ravel()
         return points
+
+
+def _busiest(centre: NDArray, radius: NDArray) -> float:
+    """The centre (n,) that most bodies reach with half their radius; the middlemost of such."""
+    first, last = np.sort(centre - 0.5 * radius), np.sort(centre + 0.5 * radius)
+    reached = np.searchsorted(first, centre, "right") - np.searchsorted(last, centre, "left")
+    best = centre[reached == reached.max()]
+    middle = 0.5 * (centre.min() + centre.max())
+    return float(best[np.argmin(np.abs(best - middle))])
 
 
 def distance_to_bodies(points: NDArray, bodies: Sequence[Body]) -> NDArray:
@@ -125,8 +134,9 @@ def draw_slice(
     speed = np.linalg.norm(velocity, axis=1).reshape(shape)
     along = [np.ma.masked_invalid(velocity[:, k].reshape(shape)) for k in plane.across]
     size = np.subtract(plane.high, plane.low)
-    height = _INCHES * float(size[1] / size[0]) * 0.85 + 1.0
-    figure, axes = plt.subplots(figsize=(_INCHES, height), dpi=width / _INCHES)
+    scale = _INCHES / float(size.max())
+    shape_in_inches = (scale * float(size[0]) + 1.5, 0.85 * scale * float(size[1]) + 1.0)
+    figure, axes = plt.subplots(figsize=shape_in_inches, dpi=width / _INCHES)
     try:
         top = float(np.nanmax(speed, initial=0.0)) or 1.0
         picture = axes.pcolormesh(
