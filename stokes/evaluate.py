@@ -311,7 +311,9 @@ class _CloseBodies:
             parts.append((Layers(None, self.layers.double, quantity), double))
         for layers, density in parts:
             near = NearField(
-                *(self.bodies, self.resolutions, points, layers, tolerance), threads=threads
+                *(self.bodies, self.resolutions, points, layers, tolerance),
+                threads=threads,
+                applications=1,
             )
             values += near.apply(density)[:, :, 0]
         return values

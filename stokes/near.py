@@ -25,19 +25,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stokes._scatter import Scatter
-from stokes.fmm.kernels import Kernel
-from stokes.fmm.near_field import NearField as PairSums
 from stokes.geometry import Body, Resolution
 from stokes.layers import Layers, Quantity
 from stokes.near_blocks import PanelBlocks
 from stokes.near_panels import ClosePanels, reach
-from stokes.sources import PanelSources, Surfaces
+from stokes.near_refined import RefinedPanels
+from stokes.sources import Surfaces
 
 __all__ = ["Layers", "NearField", "NearReport", "Quantity", "reach"]
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -67,6 +64,8 @@ class NearField:
         tolerance: float = 1e-6,
         owner: ArrayLike | None = None,
         threads: int = 1,
+        applications: int = 20,
+        block_memory: float = 2e9,
     ) -> None:
         """Find close pairs and make the blocks of those that need them. Not collective.
 
@@ -74,6 +73,8 @@ class NearField:
         targets   : (t, 3) in the world; on a surface the limit from outside is meant
         tolerance : of each panel's potential in its unit frame, relative to the largest density
         owner     : (t,) body that a target is a node of, which is left out; -1 for none
+        applications : how many are expected, that blocks are to pay for
+        block_memory : most bytes of blocks that others than the very closest pairs are given
 
         Raises ValueError for shapes that do not fit, or a tolerance outside (1e-14, 1).
         """
@@ -85,15 +86,18 @@ class NearField:
         self.surfaces, self._layers = Surfaces(bodies, resolutions), layers
         self._count = len(points)
         owner = None if owner is None else np.asarray(owner, np.int64)
-        close = ClosePanels.find(self.surfaces, points, layers, tolerance, owner, threads)
-        self._refined = _RefinedPanels(self.surfaces, layers, points, close, threads)
+        close = ClosePanels.find(
+            *(self.surfaces, points, layers, tolerance, owner),
+            *(threads, applications, block_memory),
+        )
+        self._refined = RefinedPanels(self.surfaces, layers, points, close, threads)
         self._blocks = PanelBlocks(self.surfaces, layers, close, tolerance, threads)
         exact = int(np.count_nonzero(close.exact))
         self.report = NearReport(
             pairs=len(close.pair),
             refined=len(close.pair) - exact,
             exact=exact,
-            sources=len(self._refined.sources.points),
+            sources=self._refined.nodes,
             bytes=self._refined.bytes + self._blocks.bytes,
         )
 
@@ -108,68 +112,3 @@ class NearField:
         self._refined.add(values, out)
         self._blocks.add(values, out)
         return out if np.ndim(density) == 3 else out[:, :, 0]
-
-
-class _RefinedPanels:
-    """Sums over refined panels less those over the panels as they are, by close pair."""
-
-    def __init__(
-        self,
-        surfaces: Surfaces,
-        layers: Layers,
-        targets: Array,
-        close: ClosePanels,
-        threads: int,
-    ) -> None:
-        self.layers, self.threads = layers, threads
-        keys = np.column_stack([close.body[close.pair], close.panel, close.by])
-        groups, group = np.unique(keys, axis=0, return_inverse=True)
-        group = group.reshape(-1)
-        order = np.argsort(group, kind="stable")
-        target = close.target[close.pair[order]]
-        self.targets = np.ascontiguousarray(targets[target].T)
-        self._scatter = Scatter(target)
-        self.ranges = _ranges(np.searchsorted(group[order], np.arange(len(groups) + 1)))
-        plain, which = np.unique(groups[:, :2], axis=0, return_inverse=True)
-        which = which.reshape(-1)
-        finer = np.flatnonzero(groups[:, 2] > 0)
-        every = np.concatenate([groups[finer], np.pad(plain, ((0, 0), (0, 2)), constant_values=1)])
-        self.sources = PanelSources(surfaces, every[:, 0], every[:, 1], every[:, 2:])
-        self._points = np.ascontiguousarray(self.sources.points.T)
-        rows = np.stack([self.sources.begin, self.sources.end], axis=1)
-        self._first_plain = int(self.sources.begin[len(finer)]) if len(groups) else 0
-        # the list of each group: its refined panel, if any, then the panel as it is
-        length = 1 + (groups[:, 2] > 0)
-        self._start = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
-        self._lists = np.empty((int(length.sum()), 2), np.int64)
-        self._lists[self._start[1:] - 1] = rows[len(finer) + which]
-        self._lists[self._start[finer]] = rows[: len(finer)]
-
-    @property
-    def bytes(self) -> int:
-        """Of sources and targets."""
-        return 2 * self._points.nbytes + self.targets.nbytes
-
-    def add(self, density: Array, out: Array) -> None:
-        """Add to out (t, rows, m)."""
-        if self.targets.shape[1] == 0:
-            return
-        values = np.zeros((density.shape[2], out.shape[1], self.targets.shape[1]))
-        weights = self.sources.weights(density, self.layers.single, self.layers.double)
-        for kernel, columns in zip(self.layers.kernels, weights, strict=True):
-            if kernel is not None:
-                self._sum(kernel, columns, values)
-        self._scatter.add(values.transpose(2, 1, 0), out)
-
-    def _sum(self, kernel: Kernel, weights: Array, values: Array) -> None:
-        weights[self._first_plain :] *= -1.0
-        columns = np.ascontiguousarray(weights.transpose(2, 1, 0))
-        sums = PairSums(kernel, threads=self.threads)
-        sums.add(
-            *(self.targets, self.ranges, self._points, columns),
-            *(self._start, self._lists, values),
-        )
-
-
-def _ranges(edges: Index) -> Index:
-    return np.ascontiguousarray(np.stack([edges[:-1], edges[1:]], axis=1), dtype=np.int64)

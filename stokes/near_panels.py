@@ -25,8 +25,11 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 _FACTORS = (1, 2, 3, 4, 6, 8)
-# Above it a block of modes is cheaper than the refined panel, after some ten applications.
-_MOST_REFINED = 16
+# Most nodes of a refined panel, in those of the panel.
+_MOST_REFINED = 64
+# Nanoseconds, on one core of a Zen 5: to refine, by node; to sum, by pair of points; to make
+# blocks, by mode and layer; to apply them, by number.
+_REFINE, _PAIR, _MAKE, _APPLY = 60.0, 0.7, 1e4, 1.2
 # C of the errors C distance^(1 - order) e^{-N xi} of single and double layers: no less was found
 # over random targets, densities and shapes.
 _CONSTANTS = {"velocity": (1.0, 30.0), "pressure": (1.0, 50.0), "stress": (30.0, 1000.0)}
@@ -97,8 +100,14 @@ class ClosePanels:
         tolerance: float,
         owner: Index | None,
         threads: int,
+        applications: int,
+        memory: float,
     ) -> ClosePanels:
-        """Of targets (t, 3) in the world; owner (t,): the body to leave out for each."""
+        """Of targets (t, 3) in the world; owner (t,): the body to leave out for each.
+
+        Refined panels that few targets share are made exact where that is cheaper over so many
+        applications, unless blocks took more memory than that.
+        """
         target, body, r, theta, z = _within_reach(surfaces, targets, layers, tolerance, owner)
         shape = surfaces.shape[body]
         tables, digits = NodeTables.of(surfaces.shapes), _digits(layers, tolerance)
@@ -107,11 +116,13 @@ class ClosePanels:
         pair = np.searchsorted(start, missed, side="right") - 1
         by = np.append(_FACTORS, 10**6)[np.searchsorted(_FACTORS, needed[missed])]
         by[by.prod(axis=1) > _MOST_REFINED] = 0
+        panel = missed - start[pair]
+        by[_better_exact(surfaces, layers, body[pair], panel, by, applications, memory)] = 0
         s, gap, step = _feet(surfaces, shape, r, z, np.unique(pair[by[:, 0] == 0]))
         if layers.order > 0:
             # all panels or none: each has singularities at its edges, which their sum has not
             by[np.abs(gap[pair]) < step[pair]] = 0
-        return cls(target, body, r, theta, z, pair, missed - start[pair], by, s, gap, step)
+        return cls(target, body, r, theta, z, pair, panel, by, s, gap, step)
 
 
 def _within_reach(
@@ -132,6 +143,34 @@ def _within_reach(
         others = owner[target] != body
         body, target = body[others], target[others]
     return target, body, *s.to_local(targets[target], body)
+
+
+def _better_exact(
+    surfaces: Surfaces,
+    layers: Layers,
+    body: Index,
+    panel: Index,
+    by: Index,
+    applications: int,
+    memory: float,
+) -> NDArray[np.bool_]:
+    """(e,) whether a block costs less than this pair's part of a refined panel."""
+    shape = surfaces.shape[body]
+    angles, nodes, modes = (
+        np.array([getattr(s.resolution, name) for s in surfaces.shapes], dtype=np.int64)[shape]
+        for name in ("angles", "nodes", "modes")
+    )
+    _, group, sharing = np.unique(
+        np.column_stack([body, panel, by]), axis=0, return_inverse=True, return_counts=True
+    )
+    sharing = sharing[group.reshape(-1)]
+    count = sum(kernel is not None for kernel in layers.kernels)
+    refined = angles * nodes * by.prod(axis=1) * (_REFINE / sharing + _PAIR * count)
+    numbers = 3 * layers.rows * nodes * (modes + 1)
+    block = _APPLY * numbers + _MAKE * count * (modes + 1) / applications
+    better = (by[:, 0] > 0) & (block < refined)
+    held = 8.0 * numbers[better | (by[:, 0] == 0)].sum()
+    return better if held <= memory else np.zeros_like(better)
 
 
 def _needed(

@@ -185,7 +185,7 @@ class _Group:
 class PanelSources:
     """Nodes of some panels of some bodies, each refined in its own way, as sources.
 
-    points (n, 3) in the world; the nodes of panel i stand in rows begin[i]:end[i].
+    count : n nodes; those of panel i stand in rows begin[i]:end[i]
     """
 
     def __init__(
@@ -209,9 +209,15 @@ class PanelSources:
             self._groups.append(group)
         self.end = np.cumsum(size)
         self.begin = self.end - size
-        self.points = np.empty((int(size.sum()), 3))
+        self.count = int(size.sum())
+
+    @property
+    def points(self) -> Array:
+        """Positions (n, 3) in the world."""
+        points = np.empty((self.count, 3))
         for group in self._groups:
-            self.points[self._rows(group.members)] = self._in_world(group)
+            points[self._rows(group.members)] = self._in_world(group)
+        return points
 
     def single_weights(self, density: Array, coefficient: ArrayLike = 1.0) -> Array:
         """Weights (n, 3, m) of the kernel `stokeslet` for a (S f) of densities (N, 3, m).
@@ -229,7 +235,7 @@ class PanelSources:
         self, density: Array, single: ArrayLike | None, double: ArrayLike | None
     ) -> tuple[Array | None, Array | None]:
         """Both at once; None for a layer whose coefficient is None."""
-        count, fields = len(self.points), density.shape[2]
+        count, fields = self.count, density.shape[2]
         out = (
             None if single is None else np.empty((count, 3, fields)),
             None if double is None else np.empty((count, 6, fields)),
