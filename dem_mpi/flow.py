@@ -82,8 +82,8 @@ def flow_file(
         result.write(out)
         say(f"wrote {out}: {found.contents}")
         if options.picture is not None:
-            result.draw(options.picture)
-            say(f"wrote {options.picture}: speed and streamlines across {case.plane_text}")
+            where = result.draw(options.picture)
+            say(f"wrote {options.picture}: speed and streamlines at {where}")
     finally:
         lock.release()
     return 0 if result.converged else NOT_CONVERGED
@@ -201,12 +201,6 @@ class Case:
         if self.grid is not None:
             return self.grid.size
         return 0 if self.listed is None else self.parallel.sum(len(self.listed))
-
-    @property
-    def plane_text(self) -> str:
-        """The plane of the picture."""
-        axis, place = self.options.plane
-        return f"{'xyz'[axis]}{'' if place is None else f' = {place:g} m'}"
 
     @cached_property
     def suspension(self) -> Suspension:
@@ -455,20 +449,22 @@ class Result:
             }
         return attributes
 
-    def draw(self, picture: Path) -> None:
-        """Collective. Draw the flow on a plane; OutputError (74) if that fails."""
+    def draw(self, picture: Path) -> str:
+        """Collective. Draw the flow on a plane; returns which. OutputError (74) if that fails."""
         from stokes.render import Plane, draw_slice
 
         case = self.case
         parallel = case.parallel
         plane = Plane.through(case.everyone, *case.options.plane, margin=_MARGIN)
         points = plane.points()
+        where = f"{'xyz'[plane.axis]} = {plane.place:.4g} m"
         first, last = _range(len(points), parallel)
         parts = parallel.gather(self.solution.velocity(points[first:last]))
         with agree(parallel, picture, "draw"):
             if parts is not None:
-                title = f"{case.bodies.path.name}, t = {case.bodies.time:g} s"
+                title = f"{case.bodies.path.name}, t = {case.bodies.time:g} s, {where}"
                 draw_slice(picture, plane, np.concatenate(parts), case.everyone, title)
+        return where
 
 
 def _summary(gid: NDArray, columns: list[tuple[NDArray, str, str]]) -> list[str]:
