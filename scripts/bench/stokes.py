@@ -76,7 +76,7 @@ def pieces(quick: bool) -> list[Piece]:
 
 
 def _single_pieces(quick: bool) -> Iterable[Piece]:
-    together = (2, 4, 6, 8) if quick else (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 30)
+    together = (2, 4, 6, 8, 12, 16, 20) if quick else (2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 30)
     sizes = [(panels, 5 * panels) for panels in together]
     if not quick:
         sizes += [(panels, 60) for panels in (2, 3, 4, 5, 6, 8, 10)]
