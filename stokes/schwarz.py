@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,6 +143,11 @@ class _Sides:
     turn: Array
     grids: tuple[PolarGrid, ...]
 
+    @cached_property
+    def first(self) -> Index:
+        """Where the coefficients of each begin (S,)."""
+        return self.place[:, 0].copy()
+
 
 class NeighbourSchwarz:
     """The one-body preconditioner and, on top of it, the close pairs of bodies.
@@ -200,8 +206,8 @@ class NeighbourSchwarz:
         Equal pairs stand next to each other, so that one product answers all of them.
         """
         distinct = {id(pair): pair for pair in pairs}
-        keys = list(distinct)
-        kind = np.array([keys.index(id(pair)) for pair in pairs], dtype=np.int64)
+        number_of = {key: number for number, key in enumerate(distinct)}
+        kind = np.array([number_of[id(pair)] for pair in pairs], dtype=np.int64)
         self._place = np.zeros((len(pairs), 3), dtype=np.int64)
         self._groups: list[tuple[PairOperator, slice, Index]] = []
         width = 3 * (self._options.pairs.modes + 1)
@@ -292,7 +298,7 @@ class NeighbourSchwarz:
             (first, np.diff(layout.offsets), layout.offsets[:-1], jobs),
             (
                 sides.grid[order],
-                sides.place[order, 0],
+                sides.first[order],
                 np.ascontiguousarray(np.swapaxes(sides.turn[order], 1, 2)),
             ),
         )
@@ -339,7 +345,7 @@ class NeighbourSchwarz:
             values,
             *self._analysis,
             self._options.pairs.modes,
-            self._sides.place[:, 0].copy(),
+            self._sides.first,
             coefficients,
         )
         return coefficients
