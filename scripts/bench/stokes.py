@@ -154,7 +154,7 @@ def _rival_pieces(quick: bool) -> Iterable[Piece]:
 
 
 def _squirmer_pieces(quick: bool) -> Iterable[Piece]:
-    edge = 2 if quick else 5
+    edge = 3 if quick else 5
     for ranks in (1,) if quick else (1, 2):
         task = {"kind": "squirmers", "edge": edge, "spacing": 2.5, "speed": 10.0,
                 "tolerance": 1e-4, "formulation": "single", "pixels": 60 if quick else 240,
