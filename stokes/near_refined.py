@@ -50,7 +50,7 @@ class RefinedPanels:
                 *(close.by[finer], target[finer]),
             ),
         ]
-        self._layers = layers
+        self._surfaces, self._layers = surfaces, layers
         self._sums = [
             None if kernel is None else PairSums(kernel, threads=threads)
             for kernel in layers.kernels
@@ -59,8 +59,9 @@ class RefinedPanels:
 
     @property
     def bytes(self) -> int:
-        """Of targets, lists and one part's weights."""
+        """Of targets, lists, refined unit shapes and one part's weights."""
         held = sum(part.targets.nbytes + part.ranges.nbytes for part in self._parts)
+        held += sum(shape.refined_bytes for shape in self._surfaces.shapes)
         return held + max((72 * part.sources.count for part in self._parts), default=0)
 
     def add(self, density: Array, out: Array) -> None:

@@ -62,9 +62,21 @@ class UnitShape:
         return Meridian(self.curve, self.resolution)
 
     def refined(self, by: Refinement) -> PanelNodes:
-        """Nodes of the refined panels, of the plain product rule."""
-        fine = replace(self.resolution, nodes=by.meridian * self.resolution.nodes)
-        return PanelNodes.of(Meridian(self.curve, fine), by.azimuth * self.resolution.angles)
+        """Nodes of the refined panels, of the plain product rule; made once."""
+        if by not in self._refined:
+            fine = replace(self.resolution, nodes=by.meridian * self.resolution.nodes)
+            meridian = Meridian(self.curve, fine)
+            self._refined[by] = PanelNodes.of(meridian, by.azimuth * self.resolution.angles)
+        return self._refined[by]
+
+    @property
+    def refined_bytes(self) -> int:
+        """Of the refined nodes that have been asked for."""
+        return sum(nodes.points.nbytes * 7 // 3 for nodes in self._refined.values())
+
+    @cached_property
+    def _refined(self) -> dict[Refinement, PanelNodes]:
+        return {}
 
 
 @dataclass(frozen=True)
