@@ -15,6 +15,22 @@ taken back, and the panel's potential added
 The density is what its nodal values say: a trigonometric polynomial in the azimuth, on each panel
 a polynomial in s. Errors are relative to the largest density; modes and Legendre coefficients of
 the density are assumed to have decayed to the tolerance at the resolution's ends.
+
+Measured on one core of a Zen 5: 27 unit spheres on a cubic lattice, each of 5 panels x 10 nodes x
+51 azimuths (69,000 nodes in all); a fast sum over them takes 0.31 s for S at 1e-6.
+
+    gap   tolerance  layers   pairs  with blocks   MB of blocks   s to plan   s to apply
+    0.1     1e-6     S       13,818          433              4         0.3         0.06
+    0.1     1e-6     S, D    29,990          648              6         0.4         0.24
+    0.1     1e-8     S       30,656        1,121             21         0.4         0.14
+    0.1     1e-8     S, D    52,714        1,506             28         0.7         0.37
+    0.01    1e-6     S       25,225        5,438             51         1.2         0.12
+    0.01    1e-6     S, D    44,398        7,134             67         2.9         0.35
+    0.01    1e-8     S, D    71,157        9,480            178         4.1         0.48
+
+Dense blocks (3 x 3 x nodes of the panel, in double precision) would take 37 kB a pair: 0.5 GB in
+the first line. Refining all sources of the fast sum instead, twice in both directions, would make
+it four times as large, and still leave corrections to the closest targets.
 """
 
 from __future__ import annotations

@@ -9,9 +9,18 @@ import numpy as np
 import pytest
 
 from stokes.fmm import direct_sum
-from stokes.geometry import Body, Meridian, Resolution, SurfaceGrid, sphere, spheroid
+from stokes.geometry import (
+    Body,
+    Meridian,
+    Resolution,
+    SurfaceGrid,
+    sphere,
+    spherocylinder,
+    spheroid,
+)
 from stokes.modes import from_modes
 from stokes.near import Layers, NearField, reach
+from stokes.resolution import resolution_for
 from stokes.sources import PanelSources, Refinement, Surfaces, UnitShape
 
 from layer_sums import PointForces, on_grid
@@ -222,6 +231,23 @@ def test_errors_stay_below_the_tolerance_at_random_targets(layers, tolerance):
         assert (error < tolerance * np.maximum(1.0, np.abs(exact).max(axis=1))).all()
 
 
+@pytest.mark.parametrize(
+    "curve",
+    [spheroid(0.05, 1.0), spheroid(1.0, 0.05), spherocylinder(0.2, 0.8)],
+    ids=["slender", "flat", "rod"],
+)
+def test_criterion_holds_on_extreme_shapes(curve):
+    """Far sides of thin bodies, sharp rims and tips, panels of unlike lengths."""
+    resolution = resolution_for(curve, 1e-6)
+    generator = np.random.default_rng(1)
+    density = resolved_density(resolution, 1e-6, generator)
+    points = points_above(curve, 10.0 ** generator.uniform(-4.0, 0.0, 60), generator)
+    for layers in (SINGLE, DOUBLE):
+        found, _ = corrected_sum(curve, resolution, layers, density, points, 1e-6)
+        exact, _ = corrected_sum(curve, resolution, layers, density, points, 1e-12)
+        assert np.abs(found - exact).max() < 1e-6
+
+
 @pytest.mark.parametrize("layers", [SINGLE, DOUBLE])
 def test_few_panels_are_corrected_in_vain(layers):
     """Of panels taken to miss 1e-6, the plain rule misses 3e-8 on most: digits go by distance."""
@@ -302,6 +328,26 @@ def test_coefficients_of_each_body_scale_its_part():
     # targets on one body see the other alone
     factor = np.where(owner == 0, 3.0, 2.0)[:, None]
     np.testing.assert_allclose(scaled, factor * unit, rtol=0, atol=1e-12)
+
+
+def test_blocks_and_refined_panels_agree():
+    """Many applications make more blocks; little memory for blocks makes fewer."""
+    bodies, resolutions, nodes, owner = neighbours()
+    density = np.concatenate(
+        [resolved_density(r, 1e-8, np.random.default_rng(0)) for r in resolutions]
+    )
+    few, many, least = (
+        NearField(
+            *(bodies, resolutions, nodes, DOUBLE, 1e-8, owner),
+            applications=applications,
+            block_memory=memory,
+        )
+        for applications, memory in ((1, 1e9), (1000, 1e9), (1000, 0.0))
+    )
+    assert least.report.exact <= few.report.exact < many.report.exact
+    assert few.report.pairs == many.report.pairs == least.report.pairs
+    for near in (many, least):
+        assert np.abs(near.apply(density) - few.apply(density)).max() < 1e-8
 
 
 def test_corrections_do_not_depend_on_threads():
