@@ -206,6 +206,9 @@ class Suspension:
         boundary_velocity : of the fluid on the surfaces, alone, in the world's frame: a function
                 of points (k, 3), or (n, 3) at `nodes`
 
+        PETSc starts with the first solution, and on all ranks of the job together: where only some
+        ranks solve, all have to import `petsc4py.PETSc` before.
+
         A solution that has not converged says so, and warns. Raises ValueError, on all ranks, for
         data of other shapes, arguments that exclude each other and velocities with a net flux.
         """
