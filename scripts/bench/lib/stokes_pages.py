@@ -347,4 +347,5 @@ def draw_flow(task: dict[str, Any], path: Path) -> None:
     scene = grid_of_spheroids(task["edge"], task["spacing"])
     plane, velocity = middle_plane(scene, task["pixels"]), np.load(task["field"])
     path.parent.mkdir(parents=True, exist_ok=True)
-    draw_slice(path, plane, velocity, scene.bodies(), f"{scene.count} active spheroids")
+    title = f"{scene.count} active spheroids"
+    draw_slice(path, plane, velocity, scene.bodies(), title, width=900)
