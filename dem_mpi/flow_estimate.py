@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dem_mpi.errors import InputError
 from dem_mpi.flow_options import FlowOptions
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 # ---- memory [B] ----------------------------------------------------------------------------
 
 _BASE = 260 << 20  # interpreter, numpy, numba and its code, MPI, PETSc, HDF5
-_MATRICES = {"single": 2, "combined": 4}  # of a level at one time: assembled, and factored
+_MATRICES = {1: 2, 2: 4}  # of a level at one time, for so many layers: assembled, and factored
 _VECTORS = 16  # beside those of GMRES's basis
 _SUM_NODE = 800  # for a layer, to three digits; as the 2.5th power of the digits
 _NEAR_NODE = 170  # for a layer at g = 1; as g^-1/2
@@ -109,44 +110,103 @@ def estimate_flow(
     from stokes.flow_file import flow_bytes
 
     report = suspension.report
-    n, b = parallel.max(np.array([suspension.offsets[-1], len(suspension.bodies)])).tolist()
-    own_points = -(-points // parallel.size)
-    layers = 2 if options.formulation == "combined" else 1
-    digits = -math.log10(report.tolerances.residual)
-    iterations = _iterations(suspension, digits)
-    gap = min(max(report.least_gap, 1e-3), _FARTHEST)
-    close = gap < _CLOSE
-    sizes = np.array(
-        [(3 * level.resolution.panels * level.resolution.nodes, level.resolution.modes + 1)
-         for level in report.levels]
-    )  # fmt: skip
-    entries = float((sizes[:, 0] ** 2 * sizes[:, 1]).sum())
-    flops = float((2.0 / 3.0 * sizes[:, 0] ** 3 * sizes[:, 1]).sum())
-    basis = min(iterations, suspension.options.restart) + _VECTORS
-    node = 8 * 3 * basis + layers * (_SUM_NODE * (digits / 3.0) ** 2.5 + _NEAR_NODE / gap**0.5)
-    memory = _BASE + 8 * _MATRICES[options.formulation] * entries + node * n
-    product = layers * n * (_SUM_APPLY * digits / 3.0 + close * _NEAR_APPLY)
-    product += 4.0 * _FLOP * entries * b / len(report.levels)  # with matrices of the mean level
-    seconds = (
-        _START
-        + _ENTRY * layers * entries / 9.0
-        + _FLOP * flops
-        + close * _NEAR_PLAN * layers * n
-        + iterations * product
-        + 2.0 * own_points * layers * _SUM_APPLY * digits / 3.0
-    )
+    work = _Work.of(parallel, suspension, options, -(-points // parallel.size))
     return FlowEstimate(
         bodies=report.bodies,
         nodes=report.nodes,
         levels=len(report.levels),
         points=points,
-        iterations=iterations,
-        memory=round(memory + _FIELD_POINT * own_points),
-        seconds=seconds,
+        iterations=work.iterations,
+        memory=round(work.memory),
+        seconds=work.seconds,
         file=flow_bytes(report.bodies, report.nodes, points),
         ranks=parallel.size,
         share=share,
     )
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What the fullest rank has to do.
+
+    nodes n, bodies b, points of the field; layers on a surface; digits of the tolerance; gap g
+    rows, modes : (levels,) 3 n_s and M + 1, of the matrices of each level
+    basis       : vectors that GMRES keeps
+    """
+
+    nodes: int
+    bodies: int
+    points: int
+    layers: int
+    digits: float
+    gap: float
+    rows: NDArray
+    modes: NDArray
+    iterations: int
+    basis: int
+
+    @classmethod
+    def of(
+        cls, parallel: Parallel, suspension: Suspension, options: FlowOptions, points: int
+    ) -> _Work:
+        """Collective. Count."""
+        report = suspension.report
+        own = np.array([suspension.offsets[-1], len(suspension.bodies)])
+        nodes, bodies = parallel.max(own).tolist()
+        digits = -math.log10(report.tolerances.residual)
+        iterations = _iterations(suspension, digits)
+        grids = [level.resolution for level in report.levels]
+        return cls(
+            nodes=nodes,
+            bodies=bodies,
+            points=points,
+            layers=2 if options.formulation == "combined" else 1,
+            digits=digits,
+            gap=_gap(suspension),
+            rows=np.array([3.0 * grid.panels * grid.nodes for grid in grids]),
+            modes=np.array([grid.modes + 1.0 for grid in grids]),
+            iterations=iterations,
+            basis=min(iterations, suspension.options.restart) + _VECTORS,
+        )
+
+    @property
+    def entries(self) -> float:
+        """Of one matrix of every level."""
+        return float(self.rows**2 @ self.modes)
+
+    @property
+    def memory(self) -> float:
+        """Largest resident size [B]."""
+        sums = self.layers * _SUM_NODE * (self.digits / 3.0) ** 2.5
+        near = self.layers * _NEAR_NODE / math.sqrt(self.gap)
+        matrices = 8 * _MATRICES[self.layers] * self.entries
+        return (
+            _BASE
+            + matrices
+            + self.nodes * (8 * 3 * self.basis + sums + near)
+            + _FIELD_POINT * self.points
+        )
+
+    @property
+    def seconds(self) -> float:
+        """Of one core."""
+        close = self.layers * self.nodes * (self.gap < _CLOSE)
+        sums = _SUM_APPLY * self.digits / 3.0 * self.layers
+        preparation = (
+            _START
+            + _ENTRY * self.layers * self.entries / 9.0
+            + _FLOP * 2.0 / 3.0 * float(self.rows**3 @ self.modes)
+            + _NEAR_PLAN * close
+        )
+        # A body multiplies with a matrix and a factor of its level, here of the mean one.
+        own = 4.0 * _FLOP * self.entries * self.bodies / len(self.rows)
+        product = sums * self.nodes + _NEAR_APPLY * close + own
+        return preparation + self.iterations * product + 2.0 * sums * self.points
+
+
+def _gap(suspension: Suspension) -> float:
+    """The least gap, between what is resolved and what is felt."""
+    return min(max(suspension.report.least_gap, 1e-3), _FARTHEST)
 
 
 def _iterations(suspension: Suspension, digits: float) -> int:
@@ -154,8 +214,7 @@ def _iterations(suspension: Suspension, digits: float) -> int:
     report = suspension.report
     if report.bodies == 1:
         return 1
-    gap = min(max(report.least_gap, 1e-3), _FARTHEST)
-    each = 1.25 * report.bodies ** (1.0 / 6.0) / gap**0.5
+    each = 1.25 * report.bodies ** (1.0 / 6.0) / math.sqrt(_gap(suspension))
     if suspension.options.preconditioner == "neighbours":
         each /= 3.0
     return min(math.ceil(digits * max(1.0, each)), suspension.options.max_iterations)
