@@ -354,6 +354,8 @@ def main() -> None:
         pages.draw(known, records, options.figure)
     if options.picture:
         (task,) = {json.dumps(p.task): p.task for p in todo if p.part == "squirmers"}.values()
+        if not Path(task["field"]).exists():
+            raise SystemExit("--picture: no flow is known; take the part `squirmers`")
         pages.draw_flow(task, options.picture)
 
 
