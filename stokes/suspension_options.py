@@ -14,9 +14,8 @@ from stokes.resolution import Resolution
 FormulationName = Literal["single", "combined"]
 PreconditionerName = Literal["body", "neighbours"]
 
-# Parts of the tolerance that each source of error is given. The residual's is the largest, as only
-# it costs iterations; the others cost digits that are cheap. Measured on random clusters.
-_RESIDUAL, _FMM, _NEAR, _RESOLUTION = 0.5, 0.2, 0.1, 0.2
+# Parts of the tolerance that each source of error is given, together less than one.
+_RESIDUAL, _FMM, _NEAR, _RESOLUTION = 0.3, 0.2, 0.1, 0.2
 _LEAST = 2e-14  # no sum of thousands of terms is more accurate
 
 
@@ -103,17 +102,22 @@ class Tolerances:
         )
 
     def for_gap(self, gap: float, options: SuspensionOptions) -> Tolerances:
-        """The same with smaller ones for sums where densities are large and cancel.
+        """The same with smaller ones for what is large in gaps. Given tolerances are kept.
 
         gap : least gap, over the radius. Tractions in it grow like 1/gap^2 of the velocities, over
-        an area in proportion to it. Given tolerances are kept.
+        an area in proportion to it, and cancel in sums. A residual is a mean over all surfaces: one
+        that concentrates in that area is 1/sqrt(gap) as large there.
         """
         share = min(1.0, gap)
-        near = max(_LEAST, self.near * share) if options.near_tolerance is None else self.near
-        fmm = self.fmm
-        if options.fmm_tolerance is None:
-            fmm = max(_LEAST, self.fmm * math.sqrt(share))
-        return replace(self, near=near, fmm=fmm)
+        scaled = {"residual": math.sqrt(share), "fmm": math.sqrt(share), "near": share}
+        return replace(
+            self,
+            **{
+                name: max(_LEAST, factor * getattr(self, name))
+                for name, factor in scaled.items()
+                if getattr(options, f"{name}_tolerance") is None
+            },
+        )
 
 
 @dataclass(frozen=True)

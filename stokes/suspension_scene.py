@@ -137,7 +137,9 @@ class _ClosePairs:
         own = table.own
         quaternion = table.quaternion[own].copy()
         round_curve = np.array([_is_sphere(curve) for curve in table.curves], dtype=bool)
-        order = np.lexsort((self.pair[:, 1], self.gap, self.pair[:, 0]))
+        # gaps equal up to round-off are told apart by places: numbers depend on the ranks
+        x, y, z = table.centre[self.pair[:, 1]].T
+        order = np.lexsort((z, y, x, np.round(self.relative, 9), self.pair[:, 0]))
         body, nearest = np.unique(self.pair[order, 0], return_index=True)
         nearest = order[nearest]
         turn = round_curve[table.curve[body]]
