@@ -271,6 +271,11 @@ class Spheroid(FourierCurve):
         """Semi-axis c along the axis of symmetry."""
         return self.cosine[1]
 
+    @cached_property
+    def bounding_radius(self) -> float:
+        # points may round to a little beyond the longer semi-axis
+        return max(self.equatorial, self.polar) * (1.0 + 4.0 * np.finfo(float).eps)
+
     def normal_offsets(self, s: ArrayLike, t: ArrayLike) -> tuple[Array, Array]:
         # nu(s).(gamma(s) - gamma(t)) = 2 pi a c sin^2(pi (s - t)/2)/|gamma'(s)|
         s, t = np.broadcast_arrays(np.asarray(s, float), np.asarray(t, float))
