@@ -106,10 +106,11 @@ class Tolerances:
 
         gap : least gap, over the radius. Tractions in it grow like 1/gap^2 of the velocities, over
         an area in proportion to it, and cancel in sums. A residual is a mean over all surfaces: one
-        that concentrates in that area is 1/sqrt(gap) as large there.
+        that concentrates in that area is some 1/sqrt(gap) as large there, and if the bodies seem to
+        approach, the fluid between them flows off 1/sqrt(gap) as fast again.
         """
         share = min(1.0, gap)
-        scaled = {"residual": math.sqrt(share), "fmm": math.sqrt(share), "near": share}
+        scaled = {"residual": min(1.0, 3.0 * gap), "fmm": math.sqrt(share), "near": share}
         return replace(
             self,
             **{
