@@ -29,7 +29,7 @@ from scipy.linalg import lu_factor, lu_solve
 
 from dem_mpi.parallel import Parallel
 from stokes.formulation import ShapeSolver
-from stokes.preconditioner import Preconditioner
+from stokes.preconditioner import BodyPreconditioner, Preconditioner
 from stokes.suspension_layout import Field
 from stokes.suspension_surfaces import OwnSurfaces
 from stokes.suspension_table import BodyTable
@@ -47,14 +47,19 @@ class CoarseForces:
     def __init__(
         self,
         inner: Preconditioner,
+        alone: BodyPreconditioner,
         known: NDArray,
         surfaces: OwnSurfaces,
         solvers: Mapping[int, ShapeSolver],
         table: BodyTable,
         parallel: Parallel,
     ) -> None:
-        """Collective. known: to `inner`, pairs (k, 2) of numbers of a body here and another."""
-        self._inner, self._surfaces, self._solvers = inner, surfaces, solvers
+        """Collective. The inner preconditioner may be that of bodies `alone` itself.
+
+        known : pairs (k, 2) of numbers of a body here and another that `inner` knows of
+        """
+        self._inner, self._alone = inner, alone
+        self._surfaces, self._solvers = surfaces, solvers
         self._parallel = parallel
         self._rows = table.own[surfaces.layout.order]
         self._count = table.count
@@ -77,8 +82,10 @@ class CoarseForces:
         """Collective. Approximate densities of residual velocities."""
         if residual.rigid is not None:
             raise ValueError("loads are given: forces between bodies are known")
-        density = self._inner.apply(residual).nodal
-        given = self._motions(residual.nodal)
+        density = alone = self._alone.apply(residual).nodal
+        if self._inner is not self._alone:
+            density = self._inner.apply(residual).nodal
+        given = self._motions(alone)
         forces = lu_solve(self._factors, self._gathered(given).ravel())
         wanted = (self._known @ forces).reshape(-1, 3)
         change = np.einsum("bji,bj->bi", self._surfaces.rotation, wanted - given)
@@ -87,12 +94,12 @@ class CoarseForces:
             group.view(density)[...] += np.moveaxis(moved, -1, 0)
         return Field(density)
 
-    def _motions(self, velocity: NDArray) -> NDArray:
-        """Velocities (b, 3) in the world of this rank's bodies, each free and alone."""
+    def _motions(self, density: NDArray) -> NDArray:
+        """Velocities (b, 3) in the world of bodies, each alone, with the loads of densities."""
         local = np.empty((self._surfaces.layout.bodies, 3))
         for group in self._surfaces.layout.groups:
             solver = self._solvers[group.shape]
-            single_layer, _ = solver.layers(solver.solve(group.columns(velocity)))
+            single_layer, _ = solver.layers(group.columns(density))
             motion = np.linalg.solve(solver.resistance, solver.loads(single_layer))
             local[group.bodies] = motion[:3].T
         return np.einsum("bij,bj->bi", self._surfaces.rotation, local)

@@ -55,6 +55,8 @@ __all__ = ["Suspension", "SuspensionOptions", "SuspensionSolution", "distribute"
 
 # Drag and torque of a sphere of radius and viscosity 1: loads over these are velocities.
 _DRAG = np.repeat([6.0 * math.pi, 8.0 * math.pi], 3)
+# Relative gap below which inverting pairs of bodies is worth its price.
+_NARROW = 0.1
 
 
 class Suspension:
@@ -355,14 +357,15 @@ class Suspension:
     def _make_preconditioner(self, free: bool) -> Preconditioner:
         """Collective. Bodies alone or close pairs of them; forces between all, if unknown."""
         surfaces, table = self._surfaces, self._scene.table
-        found: Preconditioner = BodyPreconditioner(surfaces.layout, self._solvers)
+        alone = BodyPreconditioner(surfaces.layout, self._solvers)
+        found: Preconditioner = alone
         known = np.empty((0, 2), dtype=np.int64)
-        if self.options.preconditioner == "neighbours":
+        if self._neighbours_first:
             from stokes.schwarz import ClosePairs, NeighbourOptions, NeighbourSchwarz
 
             options = NeighbourOptions()
             found = NeighbourSchwarz(
-                found,
+                alone,
                 surfaces.layout,
                 table,
                 self._solvers,
@@ -375,7 +378,14 @@ class Suspension:
             known = ClosePairs.of(table, options.reach).numbers
         if free or not 1 < table.count <= MOST_BODIES:
             return found
-        return CoarseForces(found, known, surfaces, self._solvers, table, self.parallel)
+        return CoarseForces(found, alone, known, surfaces, self._solvers, table, self.parallel)
+
+    @property
+    def _neighbours_first(self) -> bool:
+        """Whether close pairs are inverted, not bodies alone."""
+        asked = self.options.preconditioner
+        narrow = self._scene.least_gap < _NARROW
+        return asked == "neighbours" or (asked == "auto" and narrow)
 
     def _members(self) -> tuple[Members, dict[int, NDArray]]:
         """Bodies of this rank, and those of other ranks that its nodes are close to."""

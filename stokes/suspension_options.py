@@ -12,7 +12,7 @@ from stokes.fmm import FmmOptions, FmmReport
 from stokes.resolution import Resolution
 
 FormulationName = Literal["single", "combined"]
-PreconditionerName = Literal["body", "neighbours"]
+PreconditionerName = Literal["auto", "body", "neighbours"]
 
 # Parts of the tolerance that each source of error is given, together less than one.
 _RESIDUAL, _FMM, _NEAR, _RESOLUTION = 0.3, 0.2, 0.1, 0.2
@@ -27,7 +27,8 @@ class SuspensionOptions:
     """Overrides of what `Suspension` would choose from the tolerance.
 
     preconditioner : "body" inverts every body alone; "neighbours" inverts also what close bodies
-                     do to one another, which bodies closer than a tenth of their size ask for
+                     on one line do to one another; "auto" takes that for gaps below a tenth of the
+                     radius. Around both the forces between all bodies, if motions are given
     resolution     : of every body, in place of the one chosen from tolerance and neighbours
     turn_spheres   : lay the axis of a sphere's grid through its nearest neighbour, where few
                      azimuthal modes resolve what happens in the gap
@@ -40,7 +41,7 @@ class SuspensionOptions:
     memory         : most bytes on a rank; what would take more is refused before any work
     """
 
-    preconditioner: PreconditionerName = "body"
+    preconditioner: PreconditionerName = "auto"
     resolution: Resolution | None = None
     turn_spheres: bool = True
     least_gap: float = 1e-3
