@@ -267,7 +267,8 @@ class Suspension:
         self, request: Request, problem: Problem, unknown: Field, result: KrylovResult
     ) -> SuspensionSolution:
         surfaces = self._surfaces
-        found = moments(unknown.nodal, surfaces, self._solvers, self.viscosity)
+        with_double = self.formulation != "single"
+        found = moments(unknown.nodal, surfaces, self._solvers, self.viscosity, with_double)
         velocities = spins = None
         if request.boundary_velocity is None:
             motion = unknown.rigid if problem.motion is None else problem.motion

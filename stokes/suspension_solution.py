@@ -130,9 +130,14 @@ def moments(
     surfaces: OwnSurfaces,
     solvers: Mapping[int, ShapeSolver],
     viscosity: float,
+    with_double: bool,
 ) -> SurfaceMoments:
-    """Loads of the fluid on the bodies, and the layers, of a density (n, 3) of the solver."""
+    """Loads of the fluid on the bodies, and the layers, of a density (n, 3) of the solver.
+
+    with_double : whether the formulation has a double layer, which a rank without bodies cannot see
+    """
     single, double = _unit_layers(density, surfaces, solvers)
+    double = double if with_double else None
     a = surfaces.scale
     weights = surfaces.weights / surfaces.per_body(a) ** 2
     force = -surfaces.sum_over_bodies(weights[:, None] * single)
@@ -154,18 +159,16 @@ def moments(
 
 def _unit_layers(
     density: NDArray, surfaces: OwnSurfaces, solvers: Mapping[int, ShapeSolver]
-) -> tuple[NDArray, NDArray | None]:
+) -> tuple[NDArray, NDArray]:
     """rho and mu (n, 3) of the unit shapes at viscosity 1, in the bodies' frames."""
-    single, double = np.empty_like(density), np.empty_like(density)
-    doubled = False
+    single, double = np.empty_like(density), np.zeros_like(density)
     for group in surfaces.layout.groups:
         columns = group.columns(density)
         rho, mu = solvers[group.shape].layers(columns)
         group.put(single, rho)
         if mu is not None:
-            doubled = True
             group.put(double, mu)
-    return single, double if doubled else None
+    return single, double
 
 
 def _symmetric_traceless(tensors: NDArray) -> NDArray:
