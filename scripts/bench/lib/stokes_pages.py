@@ -282,7 +282,7 @@ def _draw_stages(axis: Any, found: Known, records: Sequence[Any]) -> None:
     together = [(r["nodes"], r["seconds"]) for p, r in found
                 if p.task["modes"] == 5 * p.task["panels"]]  # fmt: skip
     for stage in SINGLE_STAGES if len(together) > 1 else ():
-        line = sorted((nodes, seconds[stage]) for nodes, seconds in together)
+        line = sorted((nodes, max(seconds[stage], 1e-5)) for nodes, seconds in together)
         label = f"{stage}, N^{grown[stage]:.2f}" if stage in grown else stage
         axis.loglog(*zip(*line, strict=True), "o-", label=label)
     axis.set(xlabel="nodes on the surface N", ylabel="seconds, one core", title="stages")
