@@ -62,13 +62,10 @@ def _least_rho(s, roots, a, b):
 
 
 @jit
-def divide_panels(
-    targets, target_s, pairs, all_pairs, edges, s, W, dW, d2W, rho_panel, rho_piece, rho_log
-):
+def divide_panels(targets, target_s, pairs, edges, s, W, dW, d2W, rho_panel, rho_piece, rho_log):
     """Divide the panels of pairs (target, panel) that their own Gauss rule does not integrate.
 
-    targets : (n,) complex, r + i z. target_s : (n,) parameters of targets on the curve, NaN off
-    it. pairs : (m, 2). all_pairs : divide panels also where their own rule would do. edges :
+    targets : (n,) complex, r + i z. target_s : (n,) their parameters. pairs : (m, 2). edges :
     panels. s, W, dW, d2W : (panels, nodes). rho_... : least rho of panels with their own rule, of
     pieces with a Gauss rule, of pieces with the logarithmic rule.
     Returns pair, start, end, kind of the pieces, kept in the order of pairs and of s.
@@ -91,13 +88,11 @@ def divide_panels(
             direct = mirrored
         else:
             direct = _roots(s[k], W[k], dW[k], d2W[k], w)
-        if not (touches or all_pairs):
+        if not touches:
             rho = min(
                 _least_rho(s[k], direct, left, right), _least_rho(s[k], mirrored, left, right)
             )
-            if not np.isnan(t):
-                rho = min(rho, _bernstein(complex(t), left, right))
-            if rho >= rho_panel:
+            if min(rho, _bernstein(complex(t), left, right)) >= rho_panel:
                 continue
         depth = 1
         stack[0] = left, right
@@ -110,7 +105,7 @@ def divide_panels(
             a, b = stack[depth]
             at_end = t in (a, b)
             rho = min(_least_rho(s[k], direct, a, b), _least_rho(s[k], mirrored, a, b))
-            if not (at_end or np.isnan(t)):
+            if not at_end:
                 rho = min(rho, _bernstein(complex(t), a, b))
             if rho < (rho_log if at_end else rho_piece) and b - a > _SMALLEST:
                 middle = 0.5 * (a + b)

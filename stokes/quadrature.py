@@ -41,9 +41,7 @@ class PanelRule:
     interpolation: Array  # (q, nodes of a panel)
     points: Array  # (q, 4) r, z and normal r, z at the nodes
     difference: Array  # (q, 2) target minus node: r, z
-    offsets: (
-        Array | None
-    )  # (q, 2) nu(target), nu(node) . difference; None for targets off the curve
+    offsets: Array  # (q, 2) nu(target), nu(node) . difference
 
     @property
     def target(self) -> NDArray[np.int64]:
@@ -79,56 +77,27 @@ def interpolation_matrix(nodes: int, x: ArrayLike) -> Array:
     return rows / rows.sum(axis=1, keepdims=True)
 
 
-def self_rule(
-    meridian: Meridian, s: ArrayLike | None = None, tolerance: float = _TOLERANCE
-) -> PanelRule:
+def self_rule(meridian: Meridian, s: ArrayLike | None = None) -> PanelRule:
     """Return the rules for targets on the curve, at parameters s; by default at the nodes.
 
-    Pairs are those panels that hold the target or that their own rule misses by more than
-    `tolerance`, relative to the integral of the kernel's size.
+    Pairs are those panels that hold the target or that their own rule misses by more than 1e-15,
+    relative to the integral of the kernel's size.
     """
     s = meridian.s if s is None else np.asarray(s, float)
     points = meridian.curve.evaluate(s)
-    parts = _divided(meridian, points.r, points.z, s, None, tolerance)
-    rule = _assembled(meridian, *parts)
+    rule = _assembled(meridian, *_divided(meridian, points.r, points.z, s))
     target = rule.target
     difference = np.column_stack(meridian.curve.differences(s[target], rule.s))
     offsets = np.column_stack(meridian.curve.normal_offsets(s[target], rule.s))
     return replace(rule, difference=difference, offsets=offsets)
 
 
-def near_rule(
-    meridian: Meridian,
-    r: ArrayLike,
-    z: ArrayLike,
-    pairs: ArrayLike | None = None,
-    tolerance: float = _TOLERANCE,
-) -> PanelRule:
-    """Return the rules for targets (r, z) : (n,), off the curve.
-
-    pairs : (m, 2) targets and panels, sorted, to be given a rule in any case; by default those
-    panels that their own rule misses by more than `tolerance`. It is met for logarithmic
-    singularities; kernels as strong as stresses of the double layer err up to 100 times as much.
-    """
-    r, z = np.asarray(r, float), np.asarray(z, float)
-    parts = _divided(meridian, r, z, np.full(r.shape, np.nan), pairs, tolerance)
-    rule = _assembled(meridian, *parts)
-    target = rule.target
-    difference = np.column_stack([r[target] - rule.points[:, 0], z[target] - rule.points[:, 1]])
-    return replace(rule, difference=difference)
-
-
-def _divided(
-    meridian: Meridian, r: Array, z: Array, s: Array, pairs: ArrayLike | None, tolerance: float
-) -> tuple[NDArray[np.int64], ...]:
+def _divided(meridian: Meridian, r: Array, z: Array, s: Array) -> tuple[NDArray[np.int64], ...]:
     """Return pairs and, for their pieces, pair, start, end and kind."""
     panels, nodes = meridian.resolution.panels, meridian.resolution.nodes
-    asked = pairs is not None
-    if not asked:
-        pairs = np.column_stack(
-            [np.repeat(np.arange(len(r)), panels), np.tile(np.arange(panels), len(r))]
-        )
-    pairs = np.ascontiguousarray(pairs, np.int64)
+    pairs = np.column_stack(
+        [np.repeat(np.arange(len(r)), panels), np.tile(np.arange(panels), len(r))]
+    )
     points = meridian.points
     W, dW, d2W = (
         (a + 1j * b).reshape(panels, nodes)
@@ -138,15 +107,14 @@ def _divided(
         r + 1j * z,
         s,
         pairs,
-        asked,
         np.array(meridian.resolution.breaks),
         meridian.s.reshape(panels, nodes),
         W,
         dW,
         d2W,
-        tolerance ** (-0.5 / nodes),
-        tolerance ** (-0.5 / _PIECE_NODES),
-        tolerance ** (-1.0 / len(_log_rule.NODES)),
+        _TOLERANCE ** (-0.5 / nodes),
+        _TOLERANCE ** (-0.5 / _PIECE_NODES),
+        _TOLERANCE ** (-1.0 / len(_log_rule.NODES)),
     )
     kept, owner = np.unique(pieces[0], return_inverse=True)
     return pairs[kept], owner, *pieces[1:]
@@ -186,5 +154,5 @@ def _assembled(
         interpolation_matrix(meridian.resolution.nodes, local),
         np.column_stack([points.r, points.z, points.normal_r, points.normal_z]),
         difference=np.empty((0, 2)),
-        offsets=None,
+        offsets=np.empty((0, 2)),
     )

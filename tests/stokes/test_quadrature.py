@@ -17,7 +17,6 @@ from stokes.quadrature import (
     gauss_legendre,
     interpolation_matrix,
     log_rule,
-    near_rule,
     self_rule,
 )
 
@@ -57,20 +56,6 @@ def single_layer(meridian):
     plain *= meridian.weights * r
     source = rule.points[:, 0]
     values = ring_integral(0, r[rule.target], source, *rule.difference.T) * rule.weights * source
-    return replaced(plain, meridian, rule, values)
-
-
-def off_surface(meridian, r, z, m, **options):
-    """int f |x - x'|^-(2 m + 1) dS at targets off the surface, as a matrix."""
-    rule = near_rule(meridian, r, z, **options)
-    plain = ring_integral(
-        m, r[:, None], meridian.r, r[:, None] - meridian.r, z[:, None] - meridian.z
-    )
-    plain *= meridian.weights * meridian.r
-    source = rule.points[:, 0]
-    values = ring_integral(m, r[rule.target], source, *rule.difference.T) * rule.weights * source
-    if len(rule.s) == 0:
-        return plain
     return replaced(plain, meridian, rule, values)
 
 
@@ -226,76 +211,3 @@ def test_self_rules_agree_with_adaptive_quadrature(curve):
                         )[0]
                     )
             assert ours == pytest.approx(expected, rel=2e-12, abs=1e-13), (s, panel)
-
-
-@pytest.mark.parametrize("m", [0, 1, 2, 3])
-@pytest.mark.parametrize("gap", [1.0, 0.1, 1e-2, 1e-3])
-def test_near_rule_integrates_powers_of_the_distance_outside_a_sphere(m, gap):
-    meridian = Meridian(sphere(), Resolution.uniform(6, 16, 0))
-    angles = np.array([0, 1e-6, 0.01, 0.3, 1.0, 1.5, 2.3, 3.1, np.pi])
-    R = 1 + gap
-    r, z = R * np.sin(angles), R * np.cos(angles)
-    r[[0, -1]] = 0
-    total = off_surface(meridian, r, z, m).sum(axis=1)
-    # int |x - x'|^-(q + 2) dS = 2 pi/(q R) (gap^-q - (R + 1)^-q), q = 2 m - 1
-    q = 2 * m - 1
-    expected = 2 * np.pi / (q * R) * (gap**-q - (R + 1) ** -q)
-    # The gap itself is known to eps/gap, and enters with the power q.
-    np.testing.assert_allclose(total, expected, rtol=2e-14 + 4 * max(q, 0) * ROUND_OFF / gap)
-
-
-def test_near_rule_interpolates_densities():
-    meridian = Meridian(sphere(), Resolution.uniform(8, 16, 0))
-    angles = np.linspace(0.01, 3.1, 7)
-    for R in (1.001, 1.2, 0.99):
-        r, z = R * np.sin(angles), R * np.cos(angles)
-        for degree in (1, 6):
-            potential = off_surface(meridian, r, z, 0) @ eval_legendre(degree, meridian.z)
-            decay = R ** -(degree + 1) if R > 1 else R**degree
-            expected = 4 * np.pi / (2 * degree + 1) * eval_legendre(degree, z / R) * decay
-            np.testing.assert_allclose(potential, expected, rtol=0, atol=2e-14)
-
-
-def test_looser_tolerances_take_fewer_nodes_and_keep_what_they_promise():
-    meridian = Meridian(sphere(), Resolution.uniform(6, 10, 0))
-    angles = np.linspace(0.01, 3.1, 40)
-    R = 1.02
-    r, z = R * np.sin(angles), R * np.cos(angles)
-    counts = []
-    for tolerance in (1e-13, 1e-10, 1e-7, 1e-4):
-        counts.append(len(near_rule(meridian, r, z, tolerance=tolerance).s))
-        potential = off_surface(meridian, r, z, 0, tolerance=tolerance).sum(axis=1)
-        # A logarithm's coefficients decay one order faster than its ellipse says.
-        np.testing.assert_allclose(potential, 4 * np.pi / R, rtol=tolerance)
-    assert np.all(np.diff(counts) < 0)
-
-
-def test_panels_far_from_every_target_keep_their_own_rule():
-    meridian = Meridian(sphere(), Resolution.uniform(4, 16, 0))
-    rule = near_rule(meridian, np.array([0.0, 5.0]), np.array([4.0, 0.0]))
-    assert len(rule.pairs) == len(rule.s) == 0
-    asked = near_rule(meridian, np.array([0.0, 5.0]), np.array([4.0, 0.0]), pairs=[[0, 1], [1, 3]])
-    np.testing.assert_array_equal(asked.pairs, [[0, 1], [1, 3]])
-    np.testing.assert_array_equal(asked.target, np.repeat([0, 1], 16))
-
-
-def test_rules_carry_points_differences_and_offsets_of_their_nodes():
-    curve = spheroid(0.3, 1.0)
-    meridian = Meridian(curve, Resolution.uniform(4, 12, 0))
-    rule = self_rule(meridian)
-    target = rule.target
-    points = curve.evaluate(rule.s)
-    np.testing.assert_allclose(rule.points[:, 0], points.r)
-    np.testing.assert_allclose(rule.points[:, 3], points.normal_z)
-    plain = meridian.r[target] - points.r
-    np.testing.assert_allclose(rule.difference[:, 0], plain, rtol=0, atol=4 * ROUND_OFF)
-    np.testing.assert_array_equal(
-        rule.offsets, np.column_stack(curve.normal_offsets(meridian.s[target], rule.s))
-    )
-    # Every node's own panel is divided at it.
-    own = np.column_stack([np.arange(meridian.size), meridian.panel])
-    assert {tuple(p) for p in own} <= {tuple(p) for p in rule.pairs}
-    # The weights of a pair sum to the arc length of its panel.
-    lengths = np.add.reduceat(rule.weights, rule.starts[:-1])
-    arcs = np.bincount(meridian.panel, weights=meridian.weights)
-    np.testing.assert_allclose(lengths, arcs[rule.pairs[:, 1]], rtol=1e-10)
