@@ -23,6 +23,8 @@ from stokes.flow_file import (
     write_flow,
 )
 
+from runs import contents
+
 ATTRIBUTES = {"version": "1.2.3", "viscosity": 1e-3, "converged": 1, "frame": 7, "text": "größe"}
 GRIDS = ((4, 5), (6, 7))  # nodes along and about the axis
 
@@ -140,7 +142,8 @@ def test_every_number_of_ranks_writes_the_same_file(parallel, shared_path):
     if parallel.rank == 0:
         whole = shared_path / "whole.h5"
         write_flow(Parallel.alone(), whole, flow_of(count, field=on_grid(GRID)), np.arange(count))
-        assert (shared_path / "flow.h5").read_bytes() == whole.read_bytes()
+        # but for the seconds at which HDF5 made the groups
+        assert contents(shared_path / "flow.h5") == contents(whole)
     parallel.barrier()
 
 
