@@ -484,6 +484,8 @@ def warmup(
     """Compile all kernels into the numba cache, so that no run has to."""
     from time import perf_counter
 
+    from dem_mpi.flow import compile_kernels
+    from dem_mpi.flow_options import FlowOptions
     from dem_mpi.parallel import Parallel
     from dem_mpi.warmup import GENERAL, SPHERES, set_threads, warm_up
 
@@ -492,6 +494,7 @@ def warmup(
     parallel, kinds = Parallel(), (SPHERES, GENERAL)
     warm_up(parallel, threads, ("matrix_free", "assembled"), kinds, ("apgd", "scip"))
     warm_up(parallel, threads, kinds=kinds, law="coulomb")
+    compile_kernels(parallel, FlowOptions(threads=threads))
     _print(f"kernels ready in {perf_counter() - started:.1f} s")
 
 

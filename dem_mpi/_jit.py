@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from time import perf_counter
 
 import numba
+from numba.core import event
 
 prange = numba.prange
 
@@ -44,3 +47,37 @@ def jit_threads(function: Callable) -> ThreadedKernel:
     copy.__qualname__ = function.__qualname__ + "_threads"
     copy.__module__ = function.__module__
     return ThreadedKernel(jit(function), jit(copy, parallel=True))
+
+
+class CompileClock(event.Listener):
+    """Kernels compiled so far, not loaded from the disk cache, and the seconds that it took."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.seconds = 0.0
+        self._depth = 0
+        self._began = 0.0
+
+    def on_start(self, found: event.Event) -> None:
+        """Begin a compilation, maybe inside another one."""
+        if self._depth == 0:
+            self._began = perf_counter()
+        self._depth += 1
+        self.count += 1
+
+    def on_end(self, found: event.Event) -> None:
+        """End it."""
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += perf_counter() - self._began
+
+
+@contextmanager
+def compile_clock() -> Iterator[CompileClock]:
+    """Count what this process compiles within the block."""
+    clock = CompileClock()
+    event.register("numba:compile", clock)
+    try:
+        yield clock
+    finally:
+        event.unregister("numba:compile", clock)

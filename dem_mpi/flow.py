@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dem_mpi import __version__, shapes
+from dem_mpi._jit import compile_clock
 from dem_mpi.body_file import BodyFile
 from dem_mpi.errors import DataError, DemError, InputError, OutputError
 from dem_mpi.flow_estimate import FlowEstimate, estimate_flow
@@ -46,6 +47,7 @@ NOT_CONVERGED = DemError.exit_code
 _MARGIN = 1.0  # of a grid or a picture around the bodies, in largest radii
 _PICTURES = (".png", ".pdf", ".svg")
 _COMPILED = 1e-3  # tolerance to which two bodies are solved for to compile kernels
+_WORTH_TELLING = 2.0  # seconds of compilation
 _LISTED = 12  # bodies whose loads are printed one by one
 _CLOSE = 0.1  # gap in radii from which on neighbours are worth preconditioning with
 _STOKES = 0.1  # Reynolds number up to which the drag of a sphere is Stokes's within 2 %
@@ -72,11 +74,16 @@ def flow_file(
     found.refuse_what_does_not_fit()
     lock = OutputLock(parallel, out)
     try:
-        compile_kernels(parallel, options)
         with agree(parallel, out, "write"):
             if parallel.rank == 0:
                 require_space(out, found.file)
-        result = case.solve()
+        with compile_clock() as compiled:
+            if parallel.size > 1:
+                compile_kernels(parallel, options)
+            result = case.solve()
+        seconds = parallel.max(compiled.seconds)
+        if seconds > _WORTH_TELLING:
+            say(f"compiled kernels in {seconds:.0f} s (first run only; kept in the numba cache)")
         for line in result.lines():
             say(line)
         result.write(out)
@@ -498,8 +505,6 @@ def compile_kernels(parallel: Parallel, options: FlowOptions) -> None:
 
     Ranks that compiled at the same time would race for numba's cache on disk.
     """
-    if parallel.size == 1:
-        return
     # PETSc starts on all ranks together.
     import petsc4py.PETSc  # noqa: F401
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import product
-from typing import Any
 
 import numba
 import numpy as np
-from numba.core import event
 
+from dem_mpi._jit import compile_clock
 from dem_mpi.bodies import Bodies
 from dem_mpi.errors import InputError
 from dem_mpi.parallel import Parallel
@@ -87,7 +84,7 @@ def warm_up(
         # PETSc starts on all ranks together: one that came alone would wait for the others.
         import petsc4py.PETSc  # noqa: F401
     error = None
-    with _compilations() as compiled:
+    with compile_clock() as compiled:
         for turn in (True, False):
             if (parallel.rank == 0) == turn:
                 try:
@@ -96,27 +93,7 @@ def warm_up(
                 except Exception as caught:
                     error = caught
             parallel.raise_together(error)
-    return len(compiled)
-
-
-@contextmanager
-def _compilations() -> Iterator[list[Any]]:
-    """Yield a list to which every compilation within the block adds an item, and no load does."""
-
-    class Listener(event.Listener):
-        def on_start(self, found: event.Event) -> None:
-            begun.append(found)
-
-        def on_end(self, found: event.Event) -> None:
-            pass
-
-    begun: list[Any] = []
-    listener = Listener()
-    event.register("numba:compile", listener)
-    try:
-        yield begun
-    finally:
-        event.unregister("numba:compile", listener)
+    return compiled.count
 
 
 def kind_of(scenario: Scenario) -> str:
