@@ -60,14 +60,12 @@ class Meridian:
     @property
     def size(self) -> int:
         """Number of nodes n_s."""
-        return self.resolution.panels * self.resolution.nodes
+        return self.resolution.meridian_nodes
 
     @cached_property
     def s(self) -> Array:
         """Parameters of the nodes, rising."""
-        edges = np.array(self.resolution.breaks)
-        nodes, _ = np.polynomial.legendre.leggauss(self.resolution.nodes)
-        return (edges[:-1, None] + 0.5 * np.diff(edges)[:, None] * (1 + nodes)).ravel()
+        return self.resolution.parameters
 
     @cached_property
     def points(self) -> CurvePoints:

@@ -77,14 +77,12 @@ class PolarGrid:
     @property
     def size(self) -> int:
         """Number of rings N."""
-        return self.resolution.panels * self.resolution.nodes
+        return self.resolution.meridian_nodes
 
     @cached_property
     def s(self) -> Array:
         """Parameters of the rings."""
-        edges = np.array(self.resolution.breaks)
-        x, _ = np.polynomial.legendre.leggauss(self.resolution.nodes)
-        return (edges[:-1, None] + 0.5 * np.diff(edges)[:, None] * (1.0 + x)).ravel()
+        return self.resolution.parameters
 
     @cached_property
     def rings(self) -> NDArray[np.int64]:

@@ -68,6 +68,18 @@ class Resolution:
         return len(self.breaks) - 1
 
     @property
+    def meridian_nodes(self) -> int:
+        """Number of nodes of the meridian."""
+        return self.panels * self.nodes
+
+    @property
+    def parameters(self) -> NDArray[np.float64]:
+        """Parameters of the meridian's nodes, rising."""
+        edges = np.array(self.breaks)
+        nodes, _ = np.polynomial.legendre.leggauss(self.nodes)
+        return (edges[:-1, None] + 0.5 * np.diff(edges)[:, None] * (1 + nodes)).ravel()
+
+    @property
     def angles(self) -> int:
         """Number of equal angles about the axis."""
         return 2 * self.modes + 1
@@ -75,7 +87,7 @@ class Resolution:
     @property
     def surface_nodes(self) -> int:
         """Number of nodes of the surface."""
-        return self.panels * self.nodes * self.angles
+        return self.meridian_nodes * self.angles
 
 
 @dataclass(frozen=True)
