@@ -104,7 +104,19 @@ def effective(scenario: Scenario) -> dict[str, Any]:
     data = scenario.model_dump(mode="json")
     data["output"]["interval"] = scenario.output_every * scenario.time.step
     data["checkpoint"]["interval"] = scenario.checkpoint_every * scenario.time.step
+    if scenario.compress is None:
+        del data["compress"]  # as in scenes of runs that knew of no archive
+    else:
+        given = data["compress"]["fields"]
+        data["compress"]["fields"] = {name: _given(b) for name, b in given.items() if b is not None}
     return data
+
+
+def _given(bound: Any) -> Any:
+    """A bound of a field without the ways to state it that were not used."""
+    if isinstance(bound, dict):
+        return {kind: value for kind, value in bound.items() if value is not None}
+    return bound
 
 
 def restore_scenario(data: dict[str, Any], directory: str | Path = ".") -> Scenario:

@@ -45,6 +45,7 @@ def violations(scenario: Scenario) -> Iterator[Finding]:
     """The broken rules, in an order in which later ones may rely on earlier ones."""
     yield from _steps(scenario)
     yield from _names(scenario)
+    yield from _archive(scenario)
     yield from itertools.starmap(Finding, periodic_violations(scenario))
     for index, group in enumerate(scenario.bodies):
         if group.placement.file is not None:
@@ -91,6 +92,12 @@ def _steps(scenario: Scenario) -> Iterator[Finding]:
             legal = [f"{n * step:.12g}" for n in (math.floor(ratio), math.floor(ratio) + 1) if n]
             rule = f"must be a whole number of steps of {step:g} s; nearest: {' or '.join(legal)}"
             yield Finding(path, rule)
+
+
+def _archive(scenario: Scenario) -> Iterator[Finding]:
+    """The archive is a file of its own."""
+    if scenario.compress is not None and scenario.compress.path == scenario.output.path:
+        yield Finding(("compress", "path"), "is the trajectory, output.path; name another file")
 
 
 def _names(scenario: Scenario) -> Iterator[Finding]:

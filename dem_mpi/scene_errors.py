@@ -26,7 +26,9 @@ _BOUNDS = {
 }
 _LARGEST = 2.0**63  # whole numbers from here on are read as floats
 _TOO_LARGE = "must be a whole number of at most 18 digits"
-_UNION_MEMBERS = {"<number>", "<list>", "<uniform>", "<lognormal>", "<weighted>", "<mix>"}
+_UNION_MEMBERS = {
+    "<number>", "<list>", "<uniform>", "<lognormal>", "<weighted>", "<mix>", "<bound>", "<exact>",
+}  # fmt: skip
 _TAG_STARTS = ("literal[", "tuple[", "[key]")
 _KINDS = {
     "float_type": "a number",
@@ -223,6 +225,8 @@ def _home(model: str) -> str:
         "Oscillation": "walls[i].motion.oscillation",
         "FrictionPair": "friction.pairs[i]",
         "Rest": "time.stop_at_rest",
+        "CompressedFields": "compress.fields",
+        "ErrorBound": "compress.fields.<field>",
     }.get(model, model.lower())
 
 

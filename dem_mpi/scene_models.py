@@ -24,6 +24,7 @@ from dem_mpi.scene_base import (
     quantity,
 )
 from dem_mpi.scene_bodies import BodyGroup, Removal
+from dem_mpi.scene_compress import Compress
 from dem_mpi.scene_walls import Wall
 
 BodyField = Literal[
@@ -250,6 +251,9 @@ class Scenario(Model):
     threads: Whole = quantity("1", "Threads per rank", default=1, ge=1, le=1024)
     output: Output = note("Trajectory", default=Output())
     checkpoint: Checkpoint = note("Checkpoints", default=Checkpoint())
+    compress: Compress | None = note(
+        "Compressed archive of the frames, by default none", default=None
+    )
 
     @property
     def steps(self) -> int:
