@@ -14,6 +14,7 @@ from dem_mpi import checkpoint
 from dem_mpi.bodies import FIELDS, Bodies, ImpulseMemory
 from dem_mpi.contacts import Reference
 from dem_mpi.errors import DataError
+from dem_mpi.frame_buffer import PendingFrames
 from dem_mpi.parallel import Parallel
 from dem_mpi.partition import Partition
 
@@ -38,6 +39,7 @@ class State:
     inserted    : (groups,) bodies of each group that came in during the run
     removed, removed_mass : bodies taken out so far, and their mass [kg]
     taken, taken_mass     : the same by removal region; the rest left the domain
+    pending     : frames that wait to be compressed; None where nothing is compressed
     """
 
     bodies: Bodies
@@ -59,6 +61,7 @@ class State:
     balanced: float = 1.0
     wall_impulse: NDArray = field(default_factory=lambda: np.zeros((0, 6)))
     wall_time: float = 0.0
+    pending: PendingFrames | None = None
 
 
 def save(
@@ -111,6 +114,11 @@ def save(
         "bodies": bodies,
         "impulses": {"other": state.memory.other, "impulse": state.memory.impulse},
     }
+    if state.pending is not None:
+        attributes["archived"] = state.pending.archived
+        if len(state.pending.step):
+            groups["pending"] = state.pending.rows
+            shared |= {"pending_step": state.pending.step, "pending_time": state.pending.time}
     return checkpoint.write(
         parallel, directory, stem, state.step, groups, shared, attributes,
         ragged=_RAGGED, keep=keep, **options,
@@ -182,4 +190,17 @@ def _state_of(stored: checkpoint.Checkpoint, parallel: Parallel) -> State:
         balanced=float(attributes["balanced"]),
         wall_impulse=shared["wall_impulse"],
         wall_time=float(attributes["wall_time"]),
+        pending=_pending_of(stored),
+    )
+
+
+def _pending_of(stored: checkpoint.Checkpoint) -> PendingFrames | None:
+    if "archived" not in stored.attributes:
+        return None
+    archived = int(stored.attributes["archived"])
+    if "pending" not in stored.groups:
+        return PendingFrames(archived, np.zeros(0, np.int64), np.zeros(0), {})
+    shared = stored.shared
+    return PendingFrames(
+        archived, shared["pending_step"], shared["pending_time"], stored.groups["pending"]
     )
