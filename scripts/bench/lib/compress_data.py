@@ -34,6 +34,7 @@ CACHE = BUILD / "compress"
 SCENE = ROOT / "configs" / "sediment_archive.yaml"
 FIELDS = ("velocity", "position", "angular_velocity")
 PHASES = ("free fall", "onset", "impact", "landed", "settling", "rest")
+TAUS = (1e-1, 1e-2, 1e-3)
 STEPS = 32  # of a chunk
 STEP = 1e-3  # s
 GRAVITY = 9.81  # m/s^2
