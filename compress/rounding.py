@@ -171,7 +171,7 @@ def _orthogonalized(train: TensorTrain) -> _Sweep:
         terms.append((float(np.linalg.norm(left * rows)), left_exponent + shift, matrix.shape[1]))
         # D 4.2, line 5; r'_{k-1}, the smaller side of the matrix, is what the next core sees.
         q, r = _lq(matrix)
-        cores[k] = q.reshape(-1, *cores[k].shape[1:])
+        cores[k] = q.reshape(q.shape[0], *cores[k].shape[1:])
         cores[k - 1], more = normalized(cores[k - 1] @ r)
         shift += more
     norm = float(np.linalg.norm(cores[0]))
