@@ -183,7 +183,7 @@ class Law:
     def table(self) -> NDArray:
         """Weights (buckets and signs,) of the symbols before any has been seen, of sum 1."""
         edges = bucket_edges(self.top + 2)
-        s = _scale_value(self.scale)
+        s = scale_value(self.scale)
         if self.family == GAUSS:
             middle = (0.5 / s) * (edges[1:] + edges[:-1] - 1.0)
             weights = half_power(middle * middle) * np.diff(edges)
@@ -292,13 +292,13 @@ def _sum(weights: NDArray) -> float:
     return float(np.add.accumulate(weights)[-1])
 
 
-def _scale_value(scale: int) -> float:
+def scale_value(scale: int) -> float:
     """s of a scale given in quarters of a power of two."""
     octave, quarter = divmod(scale - SCALES_BELOW_ONE, 4)
     return math.ldexp(_QUARTERS[quarter], octave)
 
 
-def _nearest_scale(s: float) -> int:
+def nearest_scale(s: float) -> int:
     """The scale nearest to s."""
     quarters = round(4.0 * math.log2(s)) if s > 0.0 else -SCALES_BELOW_ONE
     return min(max(quarters + SCALES_BELOW_ONE, 0), SCALES - 1)
@@ -330,7 +330,7 @@ def _fit(values: NDArray) -> Law:
             s = math.log(2.0) / (
                 math.log1p(1.0 / mean) if family == UPWARDS else math.asinh(1.0 / mean)
             )
-        law = Law(family, _nearest_scale(s), top, offset)
+        law = Law(family, nearest_scale(s), top, offset)
         weights = law.table()
         if law.signed:
             weights = np.concatenate([weights[:1], weights[1::2]])

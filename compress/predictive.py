@@ -1,0 +1,605 @@
+"""Predictive coding: each body's values as a path of integers, most steps of which do not move.
+
+With a step width D, the decoded value of body i, component c at step t is
+
+    start_c + drift_c min(t, f_i - 1) + guide_itc + D (q_itc + shift)
+
+q is an integer path, of which the residuals r_t = q_t - q_{t-1} are range coded. A body at rest or
+in steady motion holds q; one in free flight holds it relative to the drift, the velocity that
+gravity adds in a step, for its first f_i steps. A guide predicts from another field, as positions
+from decoded velocities. The encoder chooses the path by least squared error plus price of the bits
+(Viterbi's algorithm), and D such that the measured error is the one allowed.
+
+The probability of a residual depends on the residuals coded before it: those of the body's last
+steps and of its other components, summed with fading weights to an activity E. Each level of E has
+a table of its own, which starts as a Laplace distribution and follows what is coded. `shift` is
+the mean of what the integers miss before and after a path moves, four numbers a block.
+
+Integers, and floating-point operations in a fixed order: all machines decode the same bits.
+
+Symbols: T steps, n bodies, w components, D step width, r residual, E activity.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from compress import _kernels_predictive as kernels
+from compress.bounds import Target, measure
+from compress.entropy import (
+    LAST_BUCKET,
+    LIMIT,
+    SCALES,
+    Reader,
+    Writer,
+    bucket_edges,
+    decode_integers,
+    encode_integers,
+    half_power,
+    nearest_scale,
+    scale_value,
+)
+
+RAW, DEFLATED, PATHS = range(3)
+SINGLE = 4  # added to the first byte for float32
+CONTEXTS = kernels.LEVELS + (kernels.LEVELS + 1) // 2
+COMPONENTS = 6  # from this one on, components share their tables
+PRIOR_WEIGHT = 12.0
+SHIFT_UNIT = 1.0 / 128.0
+SAMPLE = 2048  # bodies on which the step width is sought first
+USED = 0.985  # share of the error allowed that is worth another trial
+TRIALS = 10
+LARGEST_PATH = 2.0**45  # levels: their exact float64, with shifts, ends here
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What the decoder has to know besides the residuals.
+
+    step : D [unit of the values]; start, drift : (w,) [the same]; shifts : (5,) [D] by class of
+    residuals; ends : (n,) f_i, how many steps of each body follow the drift
+    """
+
+    shape: tuple[int, int, int]
+    step: float
+    start: NDArray
+    drift: NDArray
+    shifts: NDArray
+    ends: NDArray
+
+
+@dataclass(frozen=True)
+class _Search:
+    """How paths are chosen. price : (w, levels + 1, residuals) bits, flags : (3,) bits,
+    weight : cost of a bit [D^2]; maximum : largest error of an entry.
+    """
+
+    prices: NDArray
+    flags: NDArray
+    weight: float
+    maximum: float
+
+
+def encode(
+    values: NDArray,
+    target: Target,
+    *,
+    guide: NDArray | None = None,
+    start: NDArray | None = None,
+) -> bytes:
+    """Code a block within the target.
+
+    values : (T, n, w) float; guide : (T, n, w) predicted increments, that of step t leading to
+    values[t] (the first has no use); start : (n, w) predicted values[0], as of the last step of
+    the block before. The decoder needs the same bits of both.
+    Raises ValueError for a target of zero and for values that are not finite.
+    """
+    values = np.asarray(values)
+    if values.ndim != 3:
+        raise ValueError(f"block of shape {values.shape}: must be (steps, bodies, components)")
+    if values.dtype != np.float32:
+        values = values.astype(np.float64, copy=False)
+    if target.exact:
+        raise ValueError("predictive coding loses digits: the target must allow an error")
+    if not np.isfinite(values).all():
+        where = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
+        raise ValueError(f"value at (step, body, component) = {where} is not finite")
+    raw = _encode_raw(values)
+    if not values.size:
+        return raw
+    x = np.ascontiguousarray(values.transpose(1, 2, 0), dtype=np.float64)
+    ahead = _predictions(values.shape, guide, start)
+    coded = _encode_paths(values, x, ahead, target)
+    return raw if coded is None or len(coded) >= len(raw) else coded
+
+
+def decode(
+    data: bytes,
+    guide: NDArray | None = None,
+    start: NDArray | None = None,
+    steps: slice | None = None,
+    limit: int = LIMIT,
+) -> NDArray:
+    """The values (T', n, w) of the steps asked for (all), float32 if those were coded.
+
+    guide, start : as given to `encode`, the guide at least up to the last step asked for.
+    Raises ValueError for damaged bytes, and for blocks of more than `limit` entries.
+    """
+    if not data:
+        raise ValueError("predictive block: no bytes")
+    kind, dtype = data[0] % SINGLE, np.float32 if data[0] & SINGLE else np.float64
+    if data[0] >= 2 * SINGLE or kind > PATHS:
+        raise ValueError(f"predictive block: no such kind: {data[0]}")
+    if kind != PATHS:
+        return _decode_raw(data, kind, dtype, limit)[steps or slice(None)]
+    reader = Reader(data[1:])
+    layout, top, scales = _read_layout(reader, limit)
+    wanted = range(*(steps or slice(None)).indices(layout.shape[0]))
+    if not wanted:
+        return np.empty((0, *layout.shape[1:]), dtype)
+    last = max(wanted[0], wanted[-1])
+    residuals = _decode_residuals(reader, layout.shape, min(last + 2, layout.shape[0]), top, scales)
+    ahead = _predictions((last + 1, *layout.shape[1:]), guide, start)
+    decoded = _reconstruct(layout, residuals, ahead, last + 1)
+    return decoded[list(wanted)].astype(dtype)
+
+
+def _predictions(shape: tuple[int, int, int], guide: NDArray | None, start: NDArray | None):
+    """What is known of the values beforehand, (n, w, T) float64, or (0, w, T) where nothing is."""
+    steps, bodies, width = shape
+    if guide is None and start is None:
+        return np.empty((0, width, steps))
+    ahead = np.zeros((steps, bodies, width))
+    if guide is not None:
+        if guide.ndim != 3 or guide.shape[1:] != shape[1:] or len(guide) < steps:
+            raise ValueError(f"guide of shape {guide.shape} for a block of shape {shape}")
+        ahead[1:] = guide[1:steps]
+    if start is not None:
+        if start.shape != shape[1:]:
+            raise ValueError(f"start of shape {start.shape} for a block of shape {shape}")
+        ahead[0] = start
+    # One addition after the other along time: the same bits everywhere.
+    return np.ascontiguousarray(np.add.accumulate(ahead, axis=0).transpose(1, 2, 0))
+
+
+# ---- choice of step width and paths
+
+
+def _encode_paths(values: NDArray, x: NDArray, ahead: NDArray, target: Target) -> bytes | None:
+    """The block as paths, or None where that cannot meet the target. x : (n, w, T) of `values`."""
+    bodies, width, _ = x.shape
+    largest = float(np.abs(x).max())
+    goal = target.rmse(x.size)
+    cap = min(2.0 * target.maximum, 8.0 * largest if largest > 0.0 else math.inf)
+    step = min(math.sqrt(12.0) * goal, cap if math.isfinite(cap) else 1.0)
+    if not 1e-303 < step < 1e304 or largest > LARGEST_PATH * step:
+        return None
+    start, drift = np.zeros(width), np.zeros(width)
+    if not len(ahead):
+        start = np.median(x[:, :, 0], axis=0)
+        drift = _find_drift(x)
+    search = _Search(_first_prices(width), np.array([1.0, 6.0, 1.0]), 0.15, target.maximum)
+    sample = slice(None, None, max(1, bodies // SAMPLE))
+    near, near_ahead = np.ascontiguousarray(x[sample]), np.ascontiguousarray(ahead[sample])
+    trial = _calibrate(near, near_ahead, start, drift, step, search, goal, cap)
+    if not np.any(trial.layout.ends):
+        drift = np.zeros(width)
+    return _meet(values, x, ahead, start, drift, trial, target, cap)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """Paths r (n, w, T) found with a layout, their root mean square error, and what led there."""
+
+    layout: Layout
+    residuals: NDArray
+    rmse: float
+    search: _Search
+
+
+def _try(x, ahead, start, drift, step: float, search: _Search) -> _Trial:
+    """Choose the paths at one step width. x, ahead : (n, w, T); start, drift : (w,)."""
+    bodies, width, steps = x.shape
+    step = _rounded_step(step)
+    unit_start, unit_drift = _units(step, steps)
+    start = np.rint(start / unit_start) * unit_start
+    drift = np.rint(drift / unit_drift) * unit_drift
+    # Where it does not leave the level, it is no drift.
+    drift = np.where(np.abs(drift) * steps > 0.5 * step, drift, 0.0)
+    ends = np.zeros(bodies, np.int64)
+    if drift.any():
+        kernels.flight_ends(x, drift, ends)
+    residuals = np.empty(x.shape, np.int64)
+    kernels.choose_paths(
+        x, ahead, start, drift, step, search.weight, search.prices, search.flags,
+        search.maximum, ends, residuals,
+    )  # fmt: skip
+    sums = np.zeros((5, 3))
+    kernels.centroid_sums(x, ahead, start, drift, step, ends, residuals, sums)
+    means = sums[:, 1] / np.maximum(sums[:, 0], 1.0)
+    shifts = np.zeros(5)
+    if search.maximum == math.inf:
+        shifts[1:] = np.clip(np.rint(means[1:] / SHIFT_UNIT), -127, 127) * SHIFT_UNIT
+    squares = sums[:, 2] - 2.0 * shifts * sums[:, 1] + shifts**2 * sums[:, 0]
+    rmse = math.sqrt(max(float(squares.sum()), 0.0) / x.size) * step
+    layout = Layout((steps, bodies, width), step, start, drift, shifts, ends)
+    return _Trial(layout, residuals, rmse, search)
+
+
+def _calibrate(x, ahead, start, drift, step, search: _Search, goal: float, cap: float) -> _Trial:
+    """Prices, weight and step width on a sample of the bodies."""
+    if goal == math.inf:
+        return _cheapest(x, ahead, start, drift, step, search)
+    for attempt in range(TRIALS):
+        trial = _try(x, ahead, start, drift, step, search)
+        search = _repriced(trial)
+        ratio = goal / trial.rmse if trial.rmse > 0.0 else 2.0
+        if attempt >= 3 and abs(ratio - 1.0) < 0.01:
+            break
+        step = min(step * min(max(ratio, 0.4), 2.0), cap)
+    return replace(trial, search=search, layout=replace(trial.layout, step=step))
+
+
+def _cheapest(x, ahead, start, drift, step, search: _Search) -> _Trial:
+    """For a pointwise bound alone: the step width that takes the fewest bits on a sample.
+
+    The widest leaves one level within reach of a value, narrower ones leave two to choose from.
+    """
+    found, fewest = None, math.inf
+    for share in (1.0, 0.75, 0.5):
+        # The error does not count as long as it keeps to the bound.
+        chosen = replace(search, weight=100.0)
+        for _ in range(3):
+            trial = _try(x, ahead, start, drift, share * step * (1.0 - 1e-9), chosen)
+            chosen = replace(_repriced(trial), weight=100.0)
+        bits = _price_of(trial.residuals, chosen.prices)
+        if bits < fewest:
+            found, fewest = replace(trial, search=chosen), bits
+    return found
+
+
+def _meet(values, x, ahead, start, drift, trial: _Trial, target: Target, cap) -> bytes | None:
+    """Paths of all bodies at the widest step whose measured error keeps to the target."""
+    best, step, lowest, highest = None, trial.layout.step, 0.0, math.inf
+    search = trial.search
+    for _ in range(TRIALS):
+        trial = _try(x, ahead, start, drift, step, search)
+        residuals = np.ascontiguousarray(trial.residuals.transpose(2, 1, 0))
+        decoded = _reconstruct(trial.layout, residuals, ahead, len(values)).astype(values.dtype)
+        errors = measure(values, decoded)
+        if target.met_by(errors):
+            best, lowest = (trial.layout, residuals), step
+            if errors.frobenius >= USED * target.frobenius or target.frobenius == math.inf:
+                break
+        else:
+            highest = step
+        ratio = target.frobenius / errors.frobenius if errors.frobenius > 0.0 else 2.0
+        if errors.maximum > target.maximum:
+            ratio = min(ratio, 0.9)
+        step = min(step * min(max(0.996 * ratio, 0.5), 2.0), cap)
+        if not lowest < step < highest:
+            step = 0.5 * (lowest + highest) if highest < math.inf else lowest
+        if step <= lowest * (1.0 + 1e-3):
+            break
+    if best is None:
+        return None
+    return _write(values.dtype, *best)
+
+
+def _find_drift(x: NDArray) -> NDArray:
+    """The increment per step (w,) that most values share, found component by component."""
+    bodies, width, steps = x.shape
+    if steps < 4:
+        return np.zeros(width)
+    moved = np.diff(x[:: max(1, bodies // 512)], axis=2)
+    drift = np.empty(width)
+    for c in range(width):
+        increments = np.sort(moved[:, c].ravel())
+        run = max(4, len(increments) // 20)
+        first = int(np.argmin(increments[run - 1 :] - increments[: len(increments) - run + 1]))
+        drift[c] = increments[first + run // 2]
+    return drift
+
+
+def _first_prices(width: int) -> NDArray:
+    """Bits (w, levels + 1, residuals) before anything is counted."""
+    return _prices_of(np.zeros((width, kernels.LEVELS + 1, 2 * kernels.SPAN + 1)))
+
+
+def _prices_of(counts: NDArray) -> NDArray:
+    sizes = np.abs(np.arange(-kernels.SPAN, kernels.SPAN + 1))
+    means = [*_prior_means(kernels.LEVELS), 3.0]
+    prior = np.array([half_power(sizes / _laplace_scale(mean)) for mean in means])
+    prior = prior / prior.sum(axis=1, keepdims=True) + 1e-5
+    weights = counts + PRIOR_WEIGHT * prior
+    return -np.log2(weights / weights.sum(axis=2, keepdims=True))
+
+
+def _counted(residuals: NDArray) -> NDArray:
+    counts = np.zeros((residuals.shape[1], kernels.LEVELS + 1, 2 * kernels.SPAN + 1))
+    kernels.count_residuals(residuals, counts)
+    return counts
+
+
+def _repriced(trial: _Trial) -> _Search:
+    """The same search with prices, and the weight of a bit, as counted in a trial."""
+    counts = _counted(trial.residuals)
+    ends, steps = trial.layout.ends, trial.layout.shape[0]
+    kinds = np.array(
+        [np.sum(ends == 0), np.sum((ends > 0) & (ends < steps)), np.sum(ends == steps)]
+    )
+    flags = -np.log2((kinds + 1.0) / (len(ends) + 3.0))
+    flags[1] += 0.8 * math.log2(steps)
+    still = counts[:, :, kernels.SPAN].sum() / counts.sum()
+    return replace(
+        trial.search, prices=_prices_of(counts), flags=flags, weight=0.11 + WEIGHT_STILL * still**2
+    )
+
+
+WEIGHT_STILL = 0.15
+
+
+def _price_of(residuals: NDArray, prices: NDArray) -> float:
+    """Bits of residuals, about."""
+    return float(np.sum(_counted(residuals) * prices))
+
+
+# ---- layout
+
+
+def _rounded_step(step: float) -> float:
+    """The nearest width below with nine binary digits."""
+    mantissa, exponent = math.frexp(step)
+    return math.ldexp(math.floor(512.0 * mantissa), exponent - 9)
+
+
+def _units(step: float, steps: int) -> tuple[float, float]:
+    """In what multiples start and drift are kept: fine enough not to be noticed after T steps."""
+    return math.ldexp(step, -4), math.ldexp(step, -6 - steps.bit_length())
+
+
+def _write(dtype, layout: Layout, residuals: NDArray) -> bytes:
+    """All bytes of a block. residuals : (T, w, n) int64."""
+    steps, _, width = layout.shape
+    writer = Writer()
+    for size in layout.shape:
+        writer.number(size)
+    mantissa, exponent = math.frexp(layout.step)
+    writer.signed(exponent)
+    writer.number(int(512.0 * mantissa) - 256)
+    for vector, unit in zip((layout.start, layout.drift), _units(layout.step, steps), strict=True):
+        for entry in vector:
+            writer.signed(round(float(entry) / unit))
+    for shift in layout.shifts[1:]:
+        writer.signed(round(float(shift) / SHIFT_UNIT))
+    if not layout.ends.any():
+        writer.number(0)
+    else:
+        writer.number(1)
+        writer.append(encode_integers(layout.ends))
+    symbols = np.empty(residuals.size, np.int32)
+    largest = np.abs(residuals).max()
+    kernels.fold(np.array([largest]), np.zeros(1, np.int64), symbols[:1], np.empty(1, np.int64))
+    top = (int(symbols[0]) + 1) // 2
+    writer.number(top)
+    scale = nearest_scale(_laplace_scale(float(np.abs(residuals[0]).mean())))
+    writer.number(scale)
+    _encode_residuals(writer, residuals, _Tables(width, top, scale))
+    return bytes([PATHS + SINGLE * (dtype == np.float32)]) + writer.finish()
+
+
+def _read_layout(reader: Reader, limit: int) -> tuple[Layout, int, int]:
+    """The layout, the largest bucket and the scale of the first step."""
+    steps = reader.number(limit)
+    bodies = reader.number(limit // max(steps, 1))
+    width = reader.number(limit // max(steps * bodies, 1))
+    if not steps * bodies * width:
+        raise ValueError("predictive block: empty")
+    exponent = reader.signed()
+    if not -1020 < exponent < 1024:
+        raise ValueError("predictive block: no such step width")
+    step = math.ldexp(256 + reader.number(255), exponent - 9)
+    vectors = []
+    for unit in _units(step, steps):
+        vectors.append(np.array([reader.signed() * unit for _ in range(width)]))
+    shifts = np.array([0.0] + [_within(reader.signed(), 127) * SHIFT_UNIT for _ in range(4)])
+    ends = np.zeros(bodies, np.int64)
+    if reader.number(1):
+        ends, used = decode_integers(reader.rest(), limit=bodies)
+        reader.take(used)
+        if len(ends) != bodies or ends.min() < 0 or ends.max() > steps:
+            raise ValueError("predictive block: flights of other bodies or steps")
+    top, scale = reader.number(LAST_BUCKET), reader.number(SCALES - 1)
+    reader.open()
+    return Layout((steps, bodies, width), step, *vectors, shifts, ends), top, scale
+
+
+def _within(value: int, bound: int) -> int:
+    if abs(value) > bound:
+        raise ValueError(f"predictive block: {value} where at most {bound} is possible")
+    return value
+
+
+# ---- residuals
+
+
+def _prior_means(count: int) -> list[float]:
+    """What |r| is expected at each level of activity, before anything is counted."""
+    # A body whose residuals all have the size m has an activity of about 32 m.
+    return [0.01, *(1.5**level / 32.0 for level in range(count - 1))]
+
+
+def _laplace_scale(mean: float) -> float:
+    """s of a distribution 2^-|r|/s over all integers with this mean of |r|."""
+    return math.log(2.0) / math.asinh(1.0 / max(mean, 1e-3))
+
+
+class _Tables:
+    """Weights of the symbols, by component and level, that follow what is coded."""
+
+    def __init__(self, width: int, top: int, scale: int) -> None:
+        edges = bucket_edges(top + 2)
+        laws = [nearest_scale(_laplace_scale(mean)) for mean in _prior_means(kernels.LEVELS)]
+        laws += [scale] * (CONTEXTS - kernels.LEVELS)
+        self._prior = np.array([self._law(edges, scale_value(law)) for law in laws])
+        self._counts = np.zeros((min(width, COMPONENTS), *self._prior.shape))
+        self._seen = np.zeros(self._counts.shape[:2], np.int64)
+
+    @staticmethod
+    def _law(edges: NDArray, s: float) -> NDArray:
+        below = half_power(edges / s)
+        weights = below[:-1] * (1.0 - half_power(np.diff(edges) / s))
+        weights = np.concatenate([0.5 * weights[:1], np.repeat(0.5 * weights[1:], 2)])
+        weights *= PRIOR_WEIGHT / max(float(np.add.accumulate(weights)[-1]), 1e-300)
+        return weights + 1e-3 / len(weights)
+
+    def runs(self, component: int, level: int, count: int):
+        """Yield (begin, end, weights) of runs coded with one table each; send their symbols."""
+        component = min(component, COMPONENTS - 1)
+        counts = self._counts[component, level]
+        begin = 0
+        while begin < count:
+            seen = int(self._seen[component, level])
+            end = min(count, begin + max(64, seen // 2))
+            symbols = yield begin, end, self._prior[level] + counts
+            counts += np.bincount(symbols, minlength=len(counts))
+            self._seen[component, level] += end - begin
+            begin = end
+
+
+def _groups(levels: NDArray):
+    """Yield (level, indices) for each level that occurs, in order."""
+    order = np.argsort(levels, kind="stable")
+    ends = np.cumsum(np.bincount(levels, minlength=CONTEXTS))
+    begin = 0
+    for level, end in enumerate(ends.tolist()):
+        if end > begin:
+            yield level, order[begin:end]
+        begin = end
+
+
+def _encode_residuals(writer: Writer, residuals: NDArray, tables: _Tables) -> None:
+    """Range code residuals (T, w, n) int64, one step and component after the other."""
+    _, width, bodies = residuals.shape
+    last, memory = np.zeros((2, width, bodies), np.int64)
+    levels = np.empty(bodies, np.uint8)
+    symbols, widths = np.empty(bodies, np.int32), np.empty(bodies, np.int64)
+    for t, now in enumerate(residuals):
+        for c in range(width):
+            kernels.levels_now(now, last, memory, c, t == 0, levels)
+            kernels.fold(now[c], last[c], symbols, widths)
+            for level, indices in _groups(levels):
+                chosen = symbols[indices]
+                runs = tables.runs(c, level, len(chosen))
+                run = next(runs, None)
+                while run:
+                    begin, end, weights = run
+                    writer.symbols(chosen[begin:end], weights)
+                    run = _send(runs, chosen[begin:end])
+            for bits in range(1, int(widths.max()) + 1):
+                open_bits = np.abs(now[c][widths == bits]) & ((1 << bits) - 1)
+                if len(open_bits):
+                    writer.bits(open_bits.astype(np.uint64), bits)
+        kernels.remember(now, t == 0, last, memory)
+
+
+def _decode_residuals(reader, shape, upto: int, top: int, scale: int) -> NDArray:
+    """The first `upto` steps of the residuals, (upto, w, n) int64."""
+    _, bodies, width = shape
+    tables = _Tables(width, top, scale)
+    residuals = np.zeros((upto, width, bodies), np.int64)
+    last, memory = np.zeros((2, width, bodies), np.int64)
+    levels = np.empty(bodies, np.uint8)
+    symbols, low = np.empty(bodies, np.int32), np.zeros(bodies, np.int64)
+    for t, now in enumerate(residuals):
+        for c in range(width):
+            kernels.levels_now(now, last, memory, c, t == 0, levels)
+            for level, indices in _groups(levels):
+                chosen = np.empty(len(indices), np.int32)
+                runs = tables.runs(c, level, len(chosen))
+                run = next(runs, None)
+                while run:
+                    begin, end, weights = run
+                    chosen[begin:end] = reader.symbols(end - begin, weights)
+                    run = _send(runs, chosen[begin:end])
+                symbols[indices] = chosen
+            bucket = (symbols + 1) // 2
+            if int(bucket.max()) >= kernels.DIRECT:
+                widths = np.maximum((bucket - kernels.DIRECT) // kernels.PARTS + 1, 0)
+                for bits in range(1, int(widths.max()) + 1):
+                    where = np.flatnonzero(widths == bits)
+                    if len(where):
+                        low[where] = reader.bits(len(where), bits)
+            kernels.unfold(symbols, low, last[c], now[c])
+        kernels.remember(now, t == 0, last, memory)
+    return residuals
+
+
+def _send(runs, symbols):
+    """The next run after these symbols, None after the last."""
+    try:
+        return runs.send(symbols)
+    except StopIteration:
+        return None
+
+
+def _reconstruct(layout: Layout, residuals: NDArray, ahead: NDArray, steps: int) -> NDArray:
+    """The first `steps` values, (steps, n, w). residuals : (steps + 1 unless the end, w, n)."""
+    total, bodies, width = layout.shape
+    out = np.empty((steps, bodies, width))
+    level = np.zeros((width, bodies), np.int64)
+    shift = np.empty(width * bodies)
+    nothing = np.zeros(width * bodies, np.int64)
+    flown = np.maximum(layout.ends - 1, 0)
+    for t in range(steps):
+        level += residuals[t]
+        before = residuals[t].ravel() if t > 0 else nothing
+        after = residuals[t + 1].ravel() if t + 1 < total else nothing
+        kernels.shifts(before, after, layout.shifts, shift)
+        offset = layout.drift[:, None] * np.minimum(t, flown)
+        offset += layout.start[:, None]
+        if len(ahead):
+            offset += ahead[:, :, t].T
+        out[t] = (offset + layout.step * (level + shift.reshape(level.shape))).T
+    return out
+
+
+# ---- raw
+
+
+def _encode_raw(values: NDArray) -> bytes:
+    """Every bit of the values, deflated by byte planes where that makes them fewer."""
+    planes = np.ascontiguousarray(values).view(np.uint8).reshape(-1, values.itemsize).T
+    plain = planes.tobytes()
+    deflated = zlib.compress(plain, 1)
+    kind = DEFLATED if len(deflated) < len(plain) else RAW
+    first = kind + SINGLE * (values.dtype == np.float32)
+    return struct.pack("<B3Q", first, *values.shape) + (deflated if kind == DEFLATED else plain)
+
+
+def _decode_raw(data: bytes, kind: int, dtype, limit: int) -> NDArray:
+    head = struct.calcsize("<B3Q")
+    if len(data) < head:
+        raise ValueError("predictive block: ends within its shape")
+    shape = struct.unpack("<3Q", data[1:head])
+    count = math.prod(shape)
+    size = count * np.dtype(dtype).itemsize
+    if count > limit:
+        raise ValueError(f"predictive block: {count} entries where at most {limit} are possible")
+    plain = data[head:]
+    if kind == DEFLATED:
+        stream = zlib.decompressobj()
+        try:
+            plain = stream.decompress(plain, size + 1)
+        except zlib.error as error:
+            raise ValueError(f"predictive block: {error}") from error
+    if len(plain) < size or (kind == DEFLATED and len(plain) > size):
+        raise ValueError(f"predictive block: {len(plain)} bytes for shape {shape}")
+    planes = np.frombuffer(plain[:size], np.uint8).reshape(np.dtype(dtype).itemsize, -1)
+    return np.ascontiguousarray(planes.T).view(dtype).reshape(shape)
