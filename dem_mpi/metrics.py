@@ -23,7 +23,10 @@ from rich.table import Table
 from dem_mpi.h5files import agree
 from dem_mpi.parallel import Parallel
 
-PHASES = ("partition", "neighbours", "contacts", "assemble", "solve", "advance", "record")
+PHASES = (
+    "partition", "neighbours", "contacts", "assemble", "solve", "advance", "record", "compress",
+)  # fmt: skip
+_ASKED_FOR = ("compress",)  # phases that most scenes have not
 
 
 class PhaseTimer:
@@ -223,6 +226,8 @@ def closing_table(parallel: Parallel, timer: PhaseTimer, wall: float, facts: lis
     for k, name in enumerate(PHASES):
         column = seconds[:, k]
         mean = float(column.mean())
+        if name in _ASKED_FOR and not column.any():
+            continue
         ratio = f"{column.max() / mean:.2f}" if mean > 0 else "-"
         table.add_row(
             name, f"{column.min():.2f}", f"{mean:.2f}", f"{column.max():.2f}", ratio,

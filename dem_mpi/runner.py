@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -35,6 +35,9 @@ from dem_mpi.signals import StopRequest
 from dem_mpi.simulation import Simulation, SolverFailureError, StepRecord, redistribute, start
 from dem_mpi.state import State, restore, save
 from dem_mpi.walls import wall_faces
+
+if TYPE_CHECKING:
+    from dem_mpi.compression import InSitu
 
 _PATIENCE = 5.0  # seconds that ranks wait for each other when one reports an error
 _MOST_CONTACTS = 4  # a body, in a bed of spheres that needs much space for its checkpoints
@@ -107,6 +110,7 @@ class Run:
         self._counts = SolverCounts()
         self._newest: Path | None = None  # checkpoint
         self._trajectory: Trajectory | None = None
+        self._archive: InSitu | None = None
         self._metrics: MetricsLog | None = None
         self._simulation: Simulation | None = None
 
@@ -122,6 +126,7 @@ class Run:
         log = self._path.parent / "metrics.jsonl"
         self._metrics = MetricsLog(self._parallel, log, state.step if resumed else -1)
         self._simulation = Simulation(self._parallel, self._scenario, state)
+        self._archive = self._open_archive(state, resumed)
         if not resumed:
             self._write_frame()
 
@@ -131,6 +136,8 @@ class Run:
             self._metrics.close()
         if self._trajectory is not None:
             self._trajectory.close()
+        if self._archive is not None:
+            self._archive.abandon()
         if self._simulation is not None:
             self._simulation.destroy()
 
@@ -217,17 +224,38 @@ class Run:
                 error = caught
         self._parallel.raise_together(error)
 
-    def _open_trajectory(self, state: State, resumed: bool) -> Trajectory:
-        scenario = self._scenario
-        attributes = {
-            "name": scenario.name,
+    def _provenance(self) -> dict[str, Any]:
+        """Where the files of the run come from."""
+        return {
+            "name": self._scenario.name,
             "scene": _json(self._loaded.effective),
             "scene_file": self._loaded.text,
             "version": __version__,
-            "seed": scenario.seed,
+            "seed": self._scenario.seed,
             "units": "SI: m, kg, s, N s, J",
-            "walls": " ".join(wall_faces(scenario).name),
         }
+
+    def _open_archive(self, state: State, resumed: bool) -> InSitu | None:
+        """Collective. The archive that the scene asks for; nothing of it is imported otherwise."""
+        section = self._scenario.compress
+        if section is None:
+            state.pending = None
+            return None
+        from dem_mpi.compression import InSitu
+
+        path = self._path.parent / section.path
+        common = (self._parallel, path, section, self._scenario.time.step, self._provenance())
+        if not resumed:
+            return InSitu.create(*common)
+        archive, message = InSitu.resume(*common, state.pending)
+        if message:
+            self._say(message)
+        state.pending = None  # the archive has it now
+        return archive
+
+    def _open_trajectory(self, state: State, resumed: bool) -> Trajectory:
+        scenario = self._scenario
+        attributes = {**self._provenance(), "walls": " ".join(wall_faces(scenario).name)}
         common = {
             "bodies": self._bodies,
             "series": wall_series(scenario),
@@ -274,16 +302,21 @@ class Run:
                 self._say(f"state before the failed step kept in {self._save().name}")
             elif self._newest is not None:
                 self._say(f"the newest checkpoint is {self._newest.name}")
+            self._flush_archive()
             raise
         progress.finish()
+        self._flush_archive()
         self._save()
         self._trajectory.seal({"steps": state.step, "flagged_steps": state.flagged})
+        if self._archive is not None:
+            self._archive.close()
         self._report()
 
     def _stop(self, progress: Progress, stop: StopRequest) -> None:
         """Collective. Save and raise StoppedError."""
         progress.finish()
         path = self._save()
+        self._flush_archive()
         self._report()
         names = [name for name in self._parallel.gather(stop.name) or [] if name]
         name = self._parallel.broadcast(names[0] if names else "")
@@ -312,9 +345,8 @@ class Run:
         """Collective. The frame, the line of metrics and the checkpoint that this step is due."""
         timer = self._simulation.timer
         last = record.step == self._scenario.steps or self._at_rest()
-        with timer.phase("record"):
-            if record.step % self._scenario.output_every == 0 or last:
-                self._write_frame()
+        if record.step % self._scenario.output_every == 0 or last:
+            self._write_frame()
         seconds = self._parallel.max(timer.step)
         memory = self._parallel.max(resident_memory())
         line = asdict(record)
@@ -332,19 +364,31 @@ class Run:
                 self._save()
 
     def _write_frame(self) -> None:
-        state = self._simulation.state
+        """Collective. A frame of the trajectory, and of the archive if there is one."""
+        state, timer = self._simulation.state, self._simulation.timer
         time = state.step * self._scenario.time.step
-        position = self._simulation.wrapped_position()
-        columns = {**state.bodies.arrays(), "position": position}
-        impulse, elapsed = self._simulation.take_wall_impulse()
-        mean = impulse / elapsed if elapsed > 0.0 else impulse
-        reactions = {"walls/force": mean[:, :3], "walls/torque": mean[:, 3:]}
-        self._trajectory.write_frame(state.step, time, columns, reactions)
+        with timer.phase("record"):
+            position = self._simulation.wrapped_position()
+            columns = {**state.bodies.arrays(), "position": position}
+            impulse, elapsed = self._simulation.take_wall_impulse()
+            mean = impulse / elapsed if elapsed > 0.0 else impulse
+            reactions = {"walls/force": mean[:, :3], "walls/torque": mean[:, 3:]}
+            self._trajectory.write_frame(state.step, time, columns, reactions)
+        if self._archive is not None:
+            with timer.phase("compress"):
+                self._archive.record(state.step, time, columns)
+
+    def _flush_archive(self) -> None:
+        """Collective. Archive the frames that wait: no more may come for a while."""
+        if self._archive is not None:
+            with self._simulation.timer.phase("compress"):
+                self._archive.flush()
 
     def _save(self) -> Path:
         """Collective. Checkpoint; the frames before it reach the disk first."""
         self._trajectory.sync()
         state = self._simulation.state
+        state.pending = None if self._archive is None else self._archive.pending
         self._newest = save(
             self._parallel,
             state,
@@ -356,6 +400,7 @@ class Run:
             time=state.step * self._scenario.time.step,
             on_stage=self._on_stage,
         )
+        state.pending = None  # a copy that is as large as the frames that wait
         return self._newest
 
     def _report(self) -> None:
@@ -364,6 +409,8 @@ class Run:
         facts = [f"{self._trajectory.frames} frames in {self._path}"]
         if state.flagged:
             facts.append(f"{state.flagged} steps missed their tolerance and are flagged")
+        if self._archive is not None:
+            facts += self._archive.facts()
         facts += self._counts.facts() + self._comings_and_goings()
         closing_table(self._parallel, self._simulation.timer, perf_counter() - self._started, facts)
 
