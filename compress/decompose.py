@@ -14,15 +14,25 @@ unfolding of what is left; U (m, r) its left singular vectors that are kept; M <
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from compress.factors import EPS, GRAM_FLOOR, Budget, Factor, gram_factor, qr_factor, split
-from compress.randomised import randomised_factor
+from compress.factors import (
+    EPS,
+    GRAM_FLOOR,
+    Budget,
+    Factor,
+    gram_factor,
+    gram_flops,
+    qr_factor,
+    qr_flops,
+    split,
+)
+from compress.randomised import randomised_factor, randomised_flops
 from compress.tensor_train import TensorTrain
 from compress.unfolding import Side, Unfolding, survey
 
@@ -40,8 +50,13 @@ EXACT = 64.0  # multiples of the unit of the values within which a rank counts a
 RANK = 32  # expected of a dimension before any is known
 PASS = 64  # flops that reading and writing an entry once costs as much time as
 LARGEST = 4096  # rows of an unfolding of several dimensions
-# Householder's triangularisation runs at half the speed of a product, and has twice the flops.
-QR_COST = 4.0
+QR_SLOWER = 2.0  # flops of a triangularisation take so much longer than those of a product
+
+FLOPS: dict[str, Callable[[Unfolding, int], float]] = {
+    "gram": lambda M, p: gram_flops(M.rows, M.columns),
+    "qr": lambda M, p: qr_flops(M.rows, M.columns),
+    "randomised": lambda M, p: randomised_flops(M.rows, M.columns, p),
+}
 
 
 @dataclass(frozen=True)
@@ -50,7 +65,7 @@ class Step:
 
     side : the end they were taken from; method : gram, qr or randomised; dimensions : how many;
     rows, columns : of the unfolding after the last of them; rank : what is left of the rows;
-    flops : of the method, counted
+    flops : of the factor, counted
     """
 
     side: Side
@@ -127,7 +142,8 @@ def tt_svd(
                 reported.
     method    : "gram" squares the condition and is taken only where its floor of about 1e-7 lies
                 well below the tolerance (else "qr" steps in); "qr" is good to rounding;
-                "randomised" pays for long dimensions of small rank; "auto" takes by counted flops.
+                "randomised" pays for long dimensions of small rank, and serves those alone;
+                "auto" takes by counted flops.
     direction : "left" takes dimensions off the left end alone, as algorithm 4.1 does; "auto" off
                 either, by cost.
     seed      : of the random matrices. The result depends on no clock and no number of threads.
@@ -207,7 +223,9 @@ def _cost(m: int, n: int, expected: int) -> float:
     shorter, r = min(m, n), min(m, n, expected)
     if r >= m:
         return math.inf
-    return ((shorter + PASS + 2.0 * r) * m * n + 10.0 * shorter**3) / (1.0 - r / m)
+    # A matrix with more rows than columns is turned by their eigenvectors, and then decomposed.
+    tall = 8.0 * m * n * n if m > n else 0.0
+    return ((shorter + PASS + 2.0 * r) * m * n + 10.0 * shorter**3 + tall) / (1.0 - r / m)
 
 
 class _Sweep:
@@ -248,7 +266,8 @@ class _Sweep:
             self.scale,
         )
         modes, caps = self._taken(peel)
-        name, factor = self._factor(M, caps[-1])
+        name, factor = self._factor(M, peel.count, caps[-1])
+        flops = FLOPS[name](M, factor.L.shape[1])
         self.budget.lose(factor.missed)
         self.lost += factor.missed
         cores, U, lost = _split_side(
@@ -268,9 +287,7 @@ class _Sweep:
             self.last -= peel.count
             rank = cores[-1].shape[0]
         self.rank[peel.side] = rank
-        self.steps.append(
-            Step(peel.side, name, peel.count, peel.rows, peel.columns, rank, factor.flops)
-        )
+        self.steps.append(Step(peel.side, name, peel.count, peel.rows, peel.columns, rank, flops))
 
     def _taken(self, peel: Peel) -> tuple[tuple[int, ...], list[int]]:
         """Lengths of the dimensions, and the caps of the bonds behind them, outer ones first."""
@@ -281,21 +298,29 @@ class _Sweep:
         bonds = slice(self.last - peel.count, self.last)
         return self.shape[taken][::-1], list(self.caps[bonds])[::-1]
 
-    def _factor(self, M: Unfolding, cap: int) -> tuple[str, Factor]:
+    def _factor(self, M: Unfolding, count: int, cap: int) -> tuple[str, Factor]:
         share = self.budget.share()
         # Of the share, the floor of a Gram matrix may take up an eighth.
         coarse = share >= 8.0 * GRAM_FLOOR * self.norm**2
         m, n = M.rows, M.columns
         shorter = min(m, n)
         wanted = self.method
+        # A random range is that of the last of the bonds. What it misses adds up in squares with
+        # the errors of that bond, but not with those of bonds before it.
+        if count > 1 and wanted in ("auto", "randomised"):
+            wanted = "gram"
         if wanted == "auto":
-            expected = min(RANK, cap)
-            direct = (1.0 if coarse else QR_COST) * m * n * shorter
-            sampled = (4.0 if coarse else 6.0) * m * n * expected
+            direct = gram_flops(m, n) if coarse else QR_SLOWER * qr_flops(m, n)
+            sampled = randomised_flops(m, n, min(RANK, cap), coarse)
+            # Half, since a rank above the expected one makes the attempt a loss.
             wanted = "randomised" if sampled < 0.5 * direct else "gram"
         if wanted == "randomised":
             found = randomised_factor(
-                M, 0.5 * share, self.norm, min(cap, shorter), self.seed + len(self.steps)
+                M,
+                0.5 * share,
+                self.norm**2 - self.lost,
+                min(cap, shorter),
+                self.seed + len(self.steps),
             )
             if found is not None:
                 return "randomised", found

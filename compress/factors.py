@@ -25,15 +25,14 @@ GRAM_FLOOR = 64.0 * EPS
 
 @dataclass(frozen=True)
 class Factor:
-    """L (m, p), the energy ||M||_F^2 - ||L||_F^2 that is missed at most, and the flops spent."""
+    """L (m, p), and the energy ||M||_F^2 - ||L||_F^2 that is missed at most."""
 
     L: NDArray
     missed: float
-    flops: float
 
 
 class Budget:
-    """The squared error that is still to be had, shared equally by the bonds that are still to come.
+    """The squared error still to be had, shared equally by the bonds still to come.
 
     With `carried`, what a bond leaves over goes to those after it; without, each bond has
     tau^2 ||X||^2 / (d - 1), as in algorithm 4.1 of S. De (PhD thesis, University of Michigan 2021).
@@ -114,15 +113,26 @@ def split(
     return cores, whole, total
 
 
+def qr_flops(m: int, n: int) -> float:
+    """Of `qr_factor` (m <= n), or of the singular vectors of M itself, which is its own factor."""
+    return 2.0 * m * m * n if m <= n else 6.0 * m * n * n + 20.0 * n**3
+
+
+def gram_flops(m: int, n: int) -> float:
+    """Of `gram_factor`: products of symmetric result have half the flops, eigenvectors 9 k^3."""
+    shorter = min(m, n)
+    return float(m) * n * shorter + 9.0 * shorter**3 + (2.0 * m * n * n if m > n else 0.0)
+
+
 def qr_factor(M: Unfolding) -> Factor:
     """L of M = L Q, block by block of columns: each is appended to L and triangularised again."""
     m, n = M.rows, M.columns
     if m >= n:
-        return Factor(M.read(), 0.0, 0.0)
+        return Factor(M.read(), 0.0)
     R = np.empty((0, m))
     for _, block in M.blocks(least=4 * m):
         R = np.linalg.qr(np.concatenate([R, block.T]), mode="r")
-    return Factor(R.T, 0.0, 2.0 * m * m * n)
+    return Factor(R.T, 0.0)
 
 
 def gram(M: Unfolding) -> NDArray:
@@ -139,16 +149,15 @@ def gram(M: Unfolding) -> NDArray:
 def gram_factor(M: Unfolding) -> Factor:
     """L from the eigenvectors of the Gram matrix of the shorter side.
 
-    It misses at most GRAM_FLOOR ||M||_F^2, so that nothing below sqrt(GRAM_FLOOR) ~ 1e-7 of the norm
-    can be told from nothing.
+    It misses at most GRAM_FLOOR ||M||_F^2: what is below sqrt(GRAM_FLOOR) ~ 1e-7 of the norm cannot
+    be told from nothing.
     """
     m, n = M.rows, M.columns
     G = gram(M)
     floor = GRAM_FLOOR * float(np.trace(G))
-    values, V = scipy.linalg.eigh(G, driver="evd", check_finite=False, overwrite_a=True)
+    values, V = np.linalg.eigh(G)
     values, V = np.maximum(values[::-1], 0.0), V[:, ::-1]
-    flops = float(m) * n * min(m, n) + 9.0 * min(m, n) ** 3
     if m <= n:
-        return Factor(V * np.sqrt(values), floor, flops)
+        return Factor(V * np.sqrt(values), floor)
     p = max(int(np.count_nonzero(np.cumsum(values[::-1])[::-1] > floor)), 1)
-    return Factor(M.read() @ V[:, :p], 2.0 * floor, flops + 2.0 * m * n * p)
+    return Factor(M.read() @ V[:, :p], 2.0 * floor)

@@ -19,46 +19,50 @@ from compress.unfolding import Unfolding
 
 FIRST = 32  # columns of the first sample
 OVERSAMPLING = 10  # columns above the largest rank that is wanted (s in B's algorithm 6)
+DRAWING = 300.0  # flops that take as long as to draw a normal number
 GIVE_UP = 0.5  # part of the shorter side above which the range is not worth finding
 
 
+def randomised_flops(m: int, n: int, size: int, coarse: bool = True) -> float:
+    """Of a basis of `size` columns: the sample, its projection, where not coarse the residual.
+
+    A normal number costs as much as DRAWING flops.
+    """
+    return (4.0 if coarse else 6.0) * m * n * size + DRAWING * n * size
+
+
 def randomised_factor(
-    M: Unfolding, allowed: float, norm: float, most: int, seed: int = 0
+    M: Unfolding, allowed: float, energy: float, most: int, seed: int = 0
 ) -> Factor | None:
     """L = Q L_B of M ~ Q B, where ||M - Q B||_F^2 <= allowed.
 
     Columns are added to Q, as many as there are already, until that holds (fixed accuracy), or
     until it has more than `most`, a cap on the rank (then with one power iteration: fixed rank).
-    norm is ||M||_F. None if the range takes up more than GIVE_UP of the shorter side: not a
+    energy is ||M||_F^2. None if the range takes up more than GIVE_UP of the shorter side: not a
     low rank.
     """
     shorter = min(M.rows, M.columns)
     generator = np.random.default_rng(seed)
-    Q, flops, size = np.empty((M.rows, 0)), 0.0, FIRST
-    energy = norm * norm
+    Q, size = np.empty((M.rows, 0)), FIRST
     coarse = allowed > 4.0 * GRAM_FLOOR * energy
     while True:
         size = min(size, most + OVERSAMPLING)
         if Q.shape[1] + size > GIVE_UP * shorter:
             return None
         Q = np.concatenate([Q, _range(M, Q, size, generator)], axis=1)
-        flops += 2.0 * M.rows * M.columns * size
         capped = Q.shape[1] >= most + OVERSAMPLING
         if capped:
             Q = _orthonormal(_apply(M, Q))
-            flops += 4.0 * M.rows * M.columns * Q.shape[1]
         B = Unfolding(M.project(Q), M.side)
-        flops += 2.0 * M.rows * M.columns * Q.shape[1]
         if coarse:
             missed = energy - float(np.vdot(B.values, B.values)) + GRAM_FLOOR * energy
         else:
             missed = _residual(M, Q, B)
-            flops += 2.0 * M.rows * M.columns * Q.shape[1]
         if missed <= allowed or capped:
             # Of B, with few rows, a factor without what a Gram matrix would miss.
             small = gram_factor(B) if coarse and B.columns > B.rows else qr_factor(B)
             L_B = small.L
-            return Factor(Q @ L_B, max(missed, 0.0) + small.missed, flops + small.flops)
+            return Factor(Q @ L_B, max(missed, 0.0) + small.missed)
         size = Q.shape[1]
 
 
