@@ -6,8 +6,8 @@
 SEDIMENT (S. De, PhD thesis, University of Michigan 2021, section 4.4; lib/compress_data.py says
 what it is and what its phases are) in chunks of 32 steps, each to a relative Frobenius error of
 1e-1, 1e-2 and 1e-3 of its own norm (floor 0). Rivals have the same measured error in every chunk
-(lib/compress_rivals.py). Ratios are of float64 bytes; bytes are those of the chunks as stored, of
-ours with what the index keeps of each, without the rest of the file around them.
+(lib/compress_rivals.py). Ratios are of float64 bytes; bytes are those of the compressed pieces, of
+ours and of rivals, without the HDF5 file around them (`file_bytes` is the whole of ours).
 
 Parts:
   sediment   archives of velocity, angular velocity, and position (with velocity, from which it
@@ -81,12 +81,14 @@ def pieces(quick: bool) -> list[Piece]:
             add("sediment", f"{fields[-1]}-{tau:.0e}", kind="archive", fields=fields, tau=tau)
     for tau in TAUS:
         add("thesis", f"{tau:.0e}", kind="thesis", tau=tau)
+    for form in ("natural", "tensorised"):
+        add("thesis", f"streamed-{form}", kind="streamed", tau=TAUS[0], form=form)
     add("ttsvd", "large", kind="ttsvd", runs=3 if quick else 5)
     for tau in LADDER[1::2] if quick else LADDER:
         add("precision", f"{tau:.0e}", kind="precision", tau=tau, runs=3 if quick else 5)
     add("stress", "packings", kind="stress")
     add("picture", "impact", kind="picture", tau=PICTURED, path=str(picture_data(quick)))
-    add("insitu", "sediment", kind="insitu", runs=3)
+    add("insitu", "sediment", kind="insitu", runs=3, end=0.512 if quick else 1.024)
     return found
 
 
@@ -213,8 +215,7 @@ def _chunk_records(known: Known) -> Iterable[Record]:
     for field in FIELDS:
         for piece, found in _archives(known, field):
             for row in found["rows"]:
-                kept = ("chunk", "phase", "coder", "order_bytes", "nrmse", "maximum", "write",
-                        "read")  # fmt: skip
+                kept = ("chunk", "phase", "coder", "nrmse", "maximum", "write", "read")
                 params = _about(piece) | {"field": field} | {k: row[k] for k in kept}
                 params["rivals"] = {k: v["bytes"] for k, v in row["rivals"].items()}
                 yield Record("compress.chunk.bytes", params, row["bytes"], "B",
@@ -225,6 +226,10 @@ def _thesis_records(known: Known) -> Iterable[Record]:
     for piece, rows in chosen(known, "thesis"):
         for row in rows:
             params = _about(piece) | row
+            if piece.task["kind"] == "streamed":
+                yield Record("compress.thesis.streamed", params,
+                             row["count"] / row["parameters"], "1")  # fmt: skip
+                continue
             count = Sediment(piece.task["quick"]).count
             params["ratio_with_order"] = count / (row["parameters"] + row["order_bytes"] / 8)
             yield Record("compress.thesis.ratio", params, count / row["parameters"], "1",

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -93,14 +93,8 @@ class Sediment:
         if (self.directory / "done").exists():
             return
         begun = any(self.directory.glob("run.checkpoint.*"))
-        command = ["-m", "dem_mpi", "run", str(SCENE), "--out", str(self.directory)]
-        command += [word for setting in self.settings for word in ("--set", setting)]
-        mpirun(2, command + ["--resume"] * begun)
+        simulate(SCENE, self.directory, self.settings, resume=begun)
         (self.directory / "done").touch()
-
-    def forget(self) -> None:
-        """Remove the run."""
-        shutil.rmtree(self.directory, ignore_errors=True)
 
     def times(self, chunk: int) -> NDArray:
         """[s] of the frames of a chunk, (STEPS,); that at 0 s belongs to none."""
@@ -148,6 +142,13 @@ class Sediment:
             speed.append(float(rms[-1]))
             largest = max(largest, float(rms.max()))
         return [phase(f, s / largest) for f, s in zip(untouched, speed, strict=True)]
+
+
+def simulate(scene: Path, place: Path, settings: Iterable[str], resume: bool = False) -> None:
+    """Run a scene on two ranks."""
+    command = ["-m", "dem_mpi", "run", str(scene), "--out", str(place)]
+    command += [word for setting in settings for word in ("--set", setting)]
+    mpirun(2, command + ["--resume"] * resume)
 
 
 def phase(untouched: float, speed: float) -> str:

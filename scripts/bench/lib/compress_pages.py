@@ -197,11 +197,15 @@ def _coder_table(known: Known) -> str:
     return _markdown(["error", *PHASES], lines)
 
 
+def _thesis(known: Known, kind: str) -> Known:
+    return [(piece, rows) for piece, rows in chosen(known, "thesis") if piece.task["kind"] == kind]
+
+
 def _thesis_table(known: Known, bodies: int) -> str:
     """His figure 4.4 by phase: parameters alone, and with the order of the bodies."""
     count = 3 * STEPS * bodies
     lines = []
-    for piece, rows in chosen(known, "thesis"):
+    for piece, rows in _thesis(known, "thesis"):
         for form in dict.fromkeys(row["form"] for row in rows):
             cells = []
             for phase in (*PHASES, None):
@@ -327,8 +331,8 @@ def _draw_over_time(axis: Any, known: Known, bodies: int, tau: float) -> None:
 
 
 def _draw_thesis(axis: Any, known: Known, bodies: int) -> None:
-    """S. De's figure 4.4, and with the bytes of the order that his figure leaves out."""
-    for piece, rows in chosen(known, "thesis")[:1]:
+    """S. De's figures 4.4 and 4.5, and with the order of bodies that they leave out."""
+    for piece, rows in _thesis(known, "thesis")[:1]:
         count = 3 * STEPS * bodies
         for form, colour in (("natural", "C0"), ("tensorised", "C3")):
             those = [row for row in rows if row["form"] == form]
@@ -338,6 +342,11 @@ def _draw_thesis(axis: Any, known: Known, bodies: int) -> None:
             axis.semilogy(times, alone, "o", color=colour, markersize=4, label=form)
             axis.semilogy(times, whole, "-", color=colour, linewidth=0.8,
                           label=f"{form}, with the order of bodies")  # fmt: skip
+        for _, streamed in _thesis(known, "streamed"):
+            form = streamed[0]["form"]
+            line = [(_time(row), row["count"] / row["parameters"]) for row in streamed]
+            axis.semilogy(*zip(*line, strict=True), "C0--" if form == "natural" else "C3--",
+                          label=f"{form}, all chunks so far")  # fmt: skip
         axis.set(xlabel="time [s]", ylabel="ratio of parameters",
                  title=f"S. De's set-up, error {_tolerance(piece.task['tau'])}")  # fmt: skip
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from compress.tensorize import morton_order
 
 FORMS = ("natural, by gid", "natural", "tensorised")
+JOINED = {True: "concatenate", False: "stack"}  # of natural chunks, and of tensorised ones
 RESORTED = 16  # from this step of a chunk on bodies lie in another order
 
 
@@ -45,6 +46,29 @@ def work(run: Sediment, tau: float) -> list[dict[str, Any]]:
                 "nrmse": error / math.sqrt(tensor.size) / float(np.ptp(velocity)),
                 "order_bytes": 0 if form == FORMS[0] else coded, "seconds": seconds,
             })  # fmt: skip
+    return rows
+
+
+def streamed(run: Sediment, tau: float, form: str) -> list[dict[str, Any]]:
+    """His figure 4.5: parameters of all chunks so far, joined as they come.
+
+    Natural chunks are joined along time (algorithm 4.3), tensorised ones in pairs and pairs of
+    pairs along new dimensions (4.4), by this project's stream, which keeps the error of the whole.
+    """
+    from compress.stream import TensorTrainStream
+
+    natural = form != "tensorised"
+    stream = TensorTrainStream(tau, axis=1 if natural else 14, form=JOINED[natural])
+    rows, count = [], 0
+    for chunk in run.chunks:
+        found = run.load(chunk, ("velocity", "position"))
+        tensor = as_tensor(found["velocity"], resorting(found["position"]), form)
+        began = process_time()
+        stream.append(tensor)
+        count += tensor.size
+        rows.append({"chunk": chunk, "phase": run.phases[chunk], "form": form, "count": count,
+                     "parameters": stream.parameters,
+                     "seconds": process_time() - began})  # fmt: skip
     return rows
 
 

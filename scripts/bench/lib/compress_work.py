@@ -5,6 +5,7 @@ A task has `kind` and `quick`, and beside it
     archive    fields, tau: an archive of the whole run; rivals at its errors of the last field
     trains     tau: velocities with tensor trains forced
     thesis     tau: S. De's own set-up (lib/compress_thesis.py)
+    streamed   tau, form: its chunks joined into one train as they come
     precision  tau, runs: one chunk of each phase, ours beside the rivals, in turn
     picture    tau, path: a frame of the impact, as it was and as restored
     ttsvd      runs: decomposition of a large tensor (lib/compress_ttsvd.py)
@@ -16,16 +17,19 @@ Seconds are CPU seconds of this process: other work on the machine does not coun
 
 from __future__ import annotations
 
+import json
 import math
+import shutil
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from statistics import median
-from time import process_time
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
-from lib.compress_data import STEP, STEPS, Sediment
+import yaml
+from lib.compress_data import SCENE, STEP, STEPS, Sediment, simulate
 from lib.compress_rivals import AIM, RIVALS, Point, Rivals, measured, pieces
 
 from compress.archive import Archive, ArchiveWriter, Block, Chunk, FieldSpec, Settings
@@ -42,6 +46,7 @@ def work(task: dict[str, Any]) -> Any:
         "archive": _archive,
         "trains": _trains,
         "thesis": _thesis,
+        "streamed": _streamed,
         "precision": _precision,
         "picture": _picture,
         "ttsvd": _ttsvd,
@@ -106,13 +111,12 @@ def _archive(run: Sediment, task: dict[str, Any]) -> dict[str, Any]:
     rivals = Rivals(run, field)
     rows = []
     for number in run.chunks:
-        block = written.coded[number]
-        coded, (errors, seconds) = block.fields[field], reading[number]
+        coded = written.coded[number].fields[field]
+        errors, seconds = reading[number]
         target = tau * run.norms(field)[number]
         rows.append({
             "chunk": number, "phase": run.phases[number], "coder": coded.coder,
-            "bytes": len(coded.data) + len(block.order),
-            "order_bytes": len(block.order), **_told(errors),
+            "bytes": len(coded.data), **_told(errors),
             "write": written.seconds[number], "read": seconds,
             "rivals": _beside(rivals, number, errors.frobenius or AIM * target, tau),
             "rivals_at_bound": _beside(rivals, number, AIM * target, tau),
@@ -195,6 +199,12 @@ def _thesis(run: Sediment, task: dict[str, Any]) -> list[dict[str, Any]]:
     return do(run, task["tau"])
 
 
+def _streamed(run: Sediment, task: dict[str, Any]) -> list[dict[str, Any]]:
+    from lib.compress_thesis import streamed
+
+    return streamed(run, task["tau"], task["form"])
+
+
 # ---- work against precision ----------------------------------------------------------------
 
 
@@ -234,7 +244,7 @@ def _row(
     run: Sediment, written: Written, reading: dict, rivals: Rivals, tau: float, number: int
 ) -> dict[str, Any]:
     coded, errors = written.coded[number], reading[number][0]
-    size = len(coded.fields["velocity"].data) + len(coded.order)
+    size = len(coded.fields["velocity"].data)
     error = errors.frobenius or AIM * tau * run.norms("velocity")[number]
     found = {name: rivals.at(name, number, error, tau) for name in RIVALS}
     beside = {
@@ -279,6 +289,58 @@ def _picture(run: Sediment, task: dict[str, Any]) -> dict[str, Any]:
             "ratio": 8 * run.count / size}  # fmt: skip
 
 
+# ---- while a run goes on -------------------------------------------------------------------
+
+
+def _insitu(run: Sediment, task: dict[str, Any]) -> dict[str, Any]:
+    """Wall seconds of a run on two ranks without and with an archive, in turn, and its share.
+
+    Only positions are written besides. `overhead` is what the run itself counts as compression over
+    all else: the difference of two runs drowns in what else the machine does.
+    """
+    seconds: dict[str, list[float]] = {"without": [], "with": []}
+    shares, size = [], 0
+    with tempfile.TemporaryDirectory() as directory:
+        for kind in [*seconds] * task["runs"]:
+            place = Path(directory) / kind
+            scene = _scene(run, Path(directory) / f"{kind}.yaml", kind == "with", task["end"])
+            began = perf_counter()
+            simulate(scene, place, run.settings)
+            seconds[kind].append(perf_counter() - began)
+            if kind == "with":
+                spent = _seconds_by_phase(place / "metrics.jsonl")
+                compression = spent.pop("compress")
+                shares.append(compression / sum(spent.values()))
+                size = (place / "run.tt.h5").stat().st_size
+            shutil.rmtree(place)
+    steps = round(task["end"] / STEP)
+    return {
+        "bodies": run.bodies, "ranks": 2, "steps": steps, "overhead": median(shares),
+        "shares": shares, "file_bytes": size, "ratio": 2 * 8 * 3 * run.bodies * steps / size,
+        **{kind: median(times) for kind, times in seconds.items()},
+    }  # fmt: skip
+
+
+def _scene(run: Sediment, path: Path, compressed: bool, end: float) -> Path:
+    scene = yaml.safe_load(SCENE.read_text())
+    scene["time"]["end"] = end
+    scene["output"]["fields"] = ["position"]
+    if compressed:
+        bounds = {"velocity": 1e-2, "position": {"pointwise": 1e-4}}
+        scene["compress"] = {"fields": bounds, "chunk": STEPS}
+    path.write_text(yaml.safe_dump(scene))
+    return path
+
+
+def _seconds_by_phase(metrics: Path) -> dict[str, float]:
+    """Sums over the steps of a run [s]."""
+    found: dict[str, float] = {}
+    for line in metrics.read_text().splitlines():
+        for phase, seconds in json.loads(line)["seconds"].items():
+            found[phase] = found.get(phase, 0.0) + seconds
+    return found
+
+
 # ---- of other files ------------------------------------------------------------------------
 
 
@@ -287,8 +349,4 @@ def _ttsvd(run: Sediment, task: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _stress(run: Sediment, task: dict[str, Any]) -> list[dict[str, Any]]:
-    raise NotImplementedError
-
-
-def _insitu(run: Sediment, task: dict[str, Any]) -> dict[str, Any]:
     raise NotImplementedError
