@@ -9,13 +9,16 @@ Symbols: T steps of the chunk; n bodies of the block; w components of a field.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from compress.bounds import Bound, Errors
+from compress import coders
+from compress.bounds import Bound, Errors, Target, measure, norm
+from dem_mpi.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -41,12 +44,17 @@ class Settings:
 
     floor [unit of the field]: relative bounds do not shrink below this times the root mean square
     of all chunks so far; trial_every: chunks between trials of all coders; step_size [s]: time
-    between two step numbers, 0 if unknown; effort: which coders are tried
+    between two step numbers, 0 if unknown
     """
 
     floor: float = 0.0
     trial_every: int = 1
     step_size: float = 0.0
+
+
+DEFAULT_SETTINGS = Settings()
+# Bytes an entry that change by this factor from chunk to chunk call for another trial.
+JUMP = 1.5
 
 
 @dataclass(frozen=True)
@@ -83,13 +91,24 @@ class CodedField:
 
 @dataclass(frozen=True)
 class CodedBlock:
-    """A block in bytes: small enough to send to the rank that writes; it can be pickled."""
+    """A block in bytes: small enough to send to the rank that writes; it can be pickled.
+
+    ends : (2, n) int32, first step of presence and the step behind the last; None: all in all
+    """
 
     gid: NDArray
-    first: NDArray | None
-    stop: NDArray | None
+    ends: NDArray | None
     fields: Mapping[str, CodedField]
-    order: bytes = b""
+
+    @property
+    def winners(self) -> dict[str, Winner]:
+        """The coder of each field."""
+        return {n: Winner.of(p.coder, len(p.data), p.errors) for n, p in self.fields.items()}
+
+    @property
+    def scales(self) -> dict[str, Scale]:
+        """How large each field is."""
+        return {n: Scale(p.errors.norm, p.errors.count) for n, p in self.fields.items()}
 
 
 @dataclass(frozen=True)
@@ -108,39 +127,283 @@ class Scale:
     norm: float = 0.0
     count: int = 0
 
+    @property
+    def rms(self) -> float:
+        """The root mean square of the entries."""
+        return self.norm / math.sqrt(max(self.count, 1))
+
+    def __add__(self, other: Scale) -> Scale:
+        """That of both together."""
+        return Scale(math.hypot(self.norm, other.norm), self.count + other.count)
+
+
+@dataclass(frozen=True)
+class Winner:
+    """The coder that a field was coded by last, and the bytes [B] that an entry took."""
+
+    coder: str
+    rate: float
+
+    @classmethod
+    def of(cls, coder: str, size: int, errors: Errors) -> Winner:
+        """That of a piece of `size` bytes with these errors."""
+        return cls(coder, size / max(errors.count, 1))
+
 
 @dataclass(frozen=True)
 class Memory:
     """What an encoder carries from chunk to chunk; an archive can tell it (`ArchiveWriter.memory`).
 
-    chunk : chunks before; total : {field: Scale of all chunks so far, all blocks};
-    winners : {field: coder and bytes of its last block}
+    chunks : how many before; total : {field: Scale of all blocks of all of them};
+    winners : {field: Winner of the last block}
     """
 
-    chunk: int = 0
+    chunks: int = 0
     total: Mapping[str, Scale] = field(default_factory=dict)
-    winners: Mapping[str, tuple[str, int]] = field(default_factory=dict)
+    winners: Mapping[str, Winner] = field(default_factory=dict)
+
+    def after(self, winners: Mapping[str, Winner], scales: Mapping[str, Scale]) -> Memory:
+        """What is carried on behind a block; `scales` are of all blocks of its chunk."""
+        total = {name: self.total.get(name, Scale()) + scale for name, scale in scales.items()}
+        return Memory(self.chunks + 1, total, winners)
 
 
 class Encoder:
-    """Codes the blocks of one rank, chunk after chunk."""
+    """Codes the blocks of one rank, chunk after chunk.
+
+    memory : what is carried on; give that of an archive to go on as if never interrupted.
+    """
 
     def __init__(
         self,
         fields: Mapping[str, FieldSpec],
-        settings: Settings = Settings(),  # noqa: B008
+        settings: Settings = DEFAULT_SETTINGS,
         memory: Memory | None = None,
     ) -> None:
-        raise NotImplementedError
+        check_fields(fields)
+        self.fields = dict(fields)
+        self.settings = settings
+        self.memory = memory or Memory()
 
     def scales(self, block: Block) -> dict[str, Scale]:
         """How large each field of this block is: gather these of all ranks, in rank order."""
-        raise NotImplementedError
+        steps = len(block.fields[next(iter(self.fields))])
+        present = presence(block, steps)
+        there = {
+            name: block.fields[name] if present is None else block.fields[name][present]
+            for name in self.fields
+        }
+        return {name: Scale(norm(values), values.size) for name, values in there.items()}
 
-    def encode(self, block: Block, scales: list[dict[str, Scale]] | None = None) -> CodedBlock:
-        """Code a block. `scales` are those of all blocks of the chunk, None: of this one alone.
+    def encode(
+        self,
+        block: Block,
+        times: NDArray,
+        scales: Sequence[Mapping[str, Scale]] | None = None,
+    ) -> CodedBlock:
+        """Code a block; times : (T,) [s] of its steps.
 
-        The blocks of a chunk share its relative bound evenly over their entries.
-        Raises InputError for values that a lossy bound has no meaning for, saying where they are.
+        `scales` are those of all blocks of the chunk, None: of this one alone. The blocks of a
+        chunk share its relative bound evenly over their entries. Raises InputError for values
+        that a lossy bound has no meaning for, saying where they are.
         """
-        raise NotImplementedError
+        check_block(block, self.fields, len(times))
+        whole = add_scales(self.fields, [self.scales(block)] if scales is None else scales)
+        present = presence(block, len(times))
+        ends = None if present is None else presence_ends(block, len(times))
+        rows = len(times) * len(block.gid) if present is None else int(present.sum())
+        coded: dict[str, CodedField] = {}
+        decoded: dict[str, NDArray] = {}
+        for name in in_order_of_guides(self.fields):
+            spec = self.fields[name]
+            values = held(block.fields[name], ends)
+            if spec.bound.kind != "exact" and values.dtype.kind == "f":
+                _require_finite(name, values, block.gid)
+            guide = None if spec.guide is None else increments(decoded[spec.guide], times)
+            target = self._target(name, values.dtype, rows * spec.width, whole[name])
+            coded[name], decoded[name] = self._encode_field(name, values, target, guide, present)
+        result = CodedBlock(block.gid, ends, {name: coded[name] for name in self.fields})
+        self.memory = self.memory.after(result.winners, whole)
+        return result
+
+    def _target(self, name: str, dtype: np.dtype, count: int, whole: Scale) -> Target:
+        """The error of this block: its share, by `count` entries, of what the chunk may have."""
+        bound = self.fields[name].bound
+        if bound.kind == "exact" or dtype.kind != "f":
+            return Target(0.0, 0.0)
+        if bound.kind == "pointwise":
+            return Target(maximum=bound.value)
+        if bound.kind == "rmse":
+            return Target(frobenius=bound.value * math.sqrt(count))
+        before = self.memory.total.get(name, Scale()) + whole
+        size = max(whole.norm, self.settings.floor * before.rms * math.sqrt(whole.count))
+        return Target(frobenius=bound.value * size * math.sqrt(count / max(whole.count, 1)))
+
+    def _encode_field(
+        self,
+        name: str,
+        values: NDArray,
+        target: Target,
+        guide: NDArray | None,
+        present: NDArray | None,
+    ) -> tuple[CodedField, NDArray]:
+        """The field in the fewest bytes, and what they decode to."""
+        names = coders.candidates(target, guide is not None)
+        last = self.memory.winners.get(name)
+        if last is None or self.memory.chunks % self.settings.trial_every == 0:
+            return _smallest(names, values, target, guide, present)
+        if last.coder not in names:
+            return _smallest(names, values, target, guide, present)
+        best = _smallest((last.coder,), values, target, guide, present)
+        rate = Winner.of("", len(best[0].data), best[0].errors).rate
+        if best[0].coder != last.coder or not last.rate / JUMP <= rate <= last.rate * JUMP:
+            # Another phase of the flow may have begun, in which another coder pays.
+            rest = tuple(n for n in names if n != last.coder)
+            best = min(best, _smallest(rest, values, target, guide, present), key=_length)
+        return best
+
+
+def _length(result: tuple[CodedField, NDArray]) -> int:
+    return len(result[0].data)
+
+
+def _smallest(
+    names: Sequence[str],
+    values: NDArray,
+    target: Target,
+    guide: NDArray | None,
+    present: NDArray | None,
+) -> tuple[CodedField, NDArray]:
+    """Of the coders named, the result in fewest bytes that keeps to the target; exact if none."""
+    best = None
+    for name in names:
+        data = coders.encode(name, values, target, guide)
+        if data is None or (best is not None and len(data) >= len(best[0].data)):
+            continue
+        decoded = coders.decode(name, data, values.dtype, values.shape, guide)
+        errors = _measure(values, decoded, present)
+        if target.met_by(errors) if not target.exact else _same_bits(values, decoded):
+            best = CodedField(name, data, errors), decoded
+    if best is not None:
+        return best
+    data = coders.encode("exact", values, target, None)
+    assert data is not None
+    return CodedField("exact", data, _measure(values, values, present)), values
+
+
+def _same_bits(values: NDArray, decoded: NDArray) -> bool:
+    return values.tobytes() == decoded.tobytes()
+
+
+def _measure(values: NDArray, decoded: NDArray, present: NDArray | None) -> Errors:
+    """Errors of the entries of bodies while they are present; NaN equal to NaN is no error."""
+    if present is not None:
+        values, decoded = values[present], decoded[present]
+    if values.dtype.kind == "f" and not np.isfinite(values).all():
+        finite = np.isfinite(values)
+        inner = measure(values[finite], decoded[finite])
+        return replace(inner, count=values.size)
+    return measure(values, decoded)
+
+
+# ---- blocks --------------------------------------------------------------------------------
+
+
+def presence_ends(block: Block, steps: int) -> NDArray[np.int32]:
+    """(2, n) first step of presence of each body, and the step behind the last."""
+    ends = np.zeros((2, len(block.gid)), np.int32)
+    ends[0] = 0 if block.first is None else block.first
+    ends[1] = steps if block.stop is None else block.stop
+    return ends
+
+
+def presence(block: Block, steps: int) -> NDArray[np.bool_] | None:
+    """(T, n) whether each body is there; None if all are in all steps."""
+    ends = presence_ends(block, steps)
+    return None if (ends[0] == 0).all() and (ends[1] == steps).all() else presence_mask(ends, steps)
+
+
+def presence_mask(ends: NDArray, steps: int) -> NDArray[np.bool_]:
+    """(T, n) whether step t is in [ends[0, b], ends[1, b]) of body b."""
+    t = np.arange(steps)[:, None]
+    return (t >= ends[0]) & (t < ends[1])
+
+
+def held(values: NDArray, ends: NDArray | None) -> NDArray:
+    """Values (T, n, w) with those of absent steps replaced by the nearest step of presence.
+
+    A body that is absent throughout gets zeros.
+    """
+    if ends is None or not values.size:
+        return np.ascontiguousarray(values)
+    low, stop = ends.astype(np.int64)
+    nearest = np.clip(np.arange(len(values))[:, None], low, np.maximum(stop - 1, low))
+    nearest = np.minimum(nearest, len(values) - 1)
+    filled = np.take_along_axis(values, nearest[:, :, None], axis=0)
+    filled[:, low >= stop] = 0
+    return filled
+
+
+def increments(decoded: NDArray, times: NDArray) -> NDArray:
+    """h_t y_t, (T, n, w) float64 with 0 for t = 0: what a field grows by from t - 1 to t."""
+    return np.diff(times, prepend=times[:1])[:, None, None] * decoded.astype(np.float64)
+
+
+def add_scales(
+    fields: Mapping[str, FieldSpec], scales: Sequence[Mapping[str, Scale]]
+) -> dict[str, Scale]:
+    """Those of all blocks together; in the order of blocks, on which the last bit depends."""
+    return {name: sum((part[name] for part in scales), Scale()) for name in fields}
+
+
+def in_order_of_guides(fields: Mapping[str, FieldSpec]) -> list[str]:
+    """Names of fields, each behind that which guides it."""
+    return sorted(fields, key=lambda name: fields[name].guide is not None)
+
+
+# ---- what is refused -----------------------------------------------------------------------
+
+
+def check_fields(fields: Mapping[str, FieldSpec]) -> None:
+    """Raise InputError unless every field can be coded by its specification."""
+    if not fields:
+        raise InputError("fields: an archive needs at least one")
+    for name, spec in fields.items():
+        dtype = np.dtype(spec.dtype)
+        if dtype.kind not in "biuf" or dtype.itemsize > 8:
+            raise InputError(f"{name}: {dtype} is no plain number of at most 8 bytes")
+        if dtype.kind == "f" and dtype.itemsize < 4 and spec.bound.kind != "exact":
+            raise InputError(f"{name}: {dtype} can only be kept exactly")
+        if spec.width < 1:
+            raise InputError(f"{name}: width {spec.width}: must be positive")
+        if spec.guide is not None:
+            guide = fields.get(spec.guide)
+            if guide is None or guide.guide is not None or guide.width != spec.width:
+                raise InputError(f"{name}: cannot be guided by {spec.guide!r}")
+
+
+def check_block(block: Block, fields: Mapping[str, FieldSpec], steps: int) -> None:
+    """Raise ValueError unless the block has rows and columns as its fields demand."""
+    gid = np.asarray(block.gid)
+    if gid.ndim != 1 or gid.dtype.kind not in "iu" or (np.diff(gid) <= 0).any():
+        raise ValueError("gid: must be integers in ascending order, each once")
+    for name, spec in fields.items():
+        values = block.fields.get(name)
+        shape = (steps, len(gid), spec.width)
+        if values is None or values.shape != shape or values.dtype != np.dtype(spec.dtype):
+            found = "nothing" if values is None else f"{values.dtype} {values.shape}"
+            raise ValueError(f"{name}: {spec.dtype} {shape} expected, {found} given")
+    for ends in (block.first, block.stop):
+        if ends is not None and (len(ends) != len(gid) or ((ends < 0) | (ends > steps)).any()):
+            raise ValueError(f"presence: must be within the {steps} steps, one a body")
+
+
+def _require_finite(name: str, values: NDArray, gid: NDArray) -> None:
+    finite = np.isfinite(values)
+    if finite.all():
+        return
+    step, row, component = (int(i) for i in np.argwhere(~finite)[0])
+    raise InputError(
+        f"{name}: {values[step, row, component]} at step {step} of the chunk, body "
+        f"{int(gid[row])}, component {component}: only an exact bound keeps it"
+    )
