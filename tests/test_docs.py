@@ -173,3 +173,38 @@ def test_every_option_of_the_fast_sums_is_explained():
     from stokes.fmm import FmmOptions
 
     assert keys_of_table(page("fmm.md"), "Options") >= {field.name for field in fields(FmmOptions)}
+
+
+# ---- compression -------------------------------------------------------------------------------
+
+
+def run_compression(number: int, path) -> str:
+    """What an example of compression prints, run in an empty directory."""
+    example = python_examples(page("compress.md"))[number]
+    (path / "example.py").write_text(example)
+    done = subprocess.run(
+        [sys.executable, "example.py"], cwd=path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_archive_of_the_example_meets_its_bound_and_reads_a_part(tmp_path):
+    printed = run_compression(0, tmp_path)
+    assert printed.startswith("(20, 100, 3)")
+    assert 0.0 < printed_error(printed) <= 1e-2
+
+
+def test_train_of_the_example_meets_its_tolerance_and_rounds_back(tmp_path):
+    lines = run_compression(1, tmp_path).splitlines()
+    assert 0.0 < printed_error(lines[0]) <= 1e-6
+    assert lines[1].startswith("(100, 5)")
+    # The longer tensor is x -> (1, 2)(x) times the first one: the same ranks do.
+    ranks, rounded = lines[2].split(" -> ")
+    assert lines[0].startswith(rounded) and ranks != rounded
+
+
+def test_every_coder_of_archives_is_explained():
+    from compress.coders import CODERS
+
+    assert keys_of_table(page("compress.md"), "Coders") == set(CODERS)

@@ -92,6 +92,7 @@ def tables(known: Known, records: Sequence[Any], version: str) -> dict[str, str]
         return {}
     bodies = Sediment(known[0][0].task["quick"]).bodies
     made = {
+        "compress ratios": _ratio_table(known, bodies),
         "compress": _total_table(known, bodies),
         "compress phases": _phase_table(known, bodies),
         "compress coders": _coder_table(known),
@@ -150,6 +151,19 @@ def _total_table(known: Known, bodies: int) -> str:
             ])  # fmt: skip
     heads = ["field", "error", "ours", *NAMES.values(), "nRMSE", "write [s]", "read [s]",
              "SZ3 write [s]", "read [s]"]  # fmt: skip
+    return _markdown(heads, lines)
+
+
+def _ratio_table(known: Known, bodies: int) -> str:
+    """Velocities alone, for a reader in a hurry."""
+    lines = [
+        [_tolerance(tau), f"**{number(_ratio(bodies, rows))}**",
+         *(number(_ratio(bodies, rows, phase_bytes(rows, name) or math.nan)) for name in NAMES),
+         number(float(np.mean([row["write"] for row in rows])), 2),
+         _mean_seconds(rows, "sz3", "write")]
+        for tau, rows in sorted(_archives(known, "velocity").items(), reverse=True)
+    ]  # fmt: skip
+    heads = ["relative error", "ours", *NAMES.values(), "ours [s a chunk]", "SZ3 [s a chunk]"]
     return _markdown(heads, lines)
 
 
