@@ -65,10 +65,11 @@ def _path(x, offset, step, weight, prices, others, maximum, r, back, base):
     Returns J.
     """
     steps = len(x)
+    inverse = 1.0 / step
     j0 = j1 = 0.0
     m0 = m1 = l0 = l1 = 0
     for t in range(steps):
-        y = (x[t] - offset[t]) / step
+        y = (x[t] - offset[t]) * inverse
         b = int(np.floor(y))
         base[t] = b
         e0 = y - b
@@ -117,10 +118,10 @@ def _path(x, offset, step, weight, prices, others, maximum, r, back, base):
 
 
 @jit
-def flight_ends(x, drift, ends):
-    """How many steps from the first on follow the drift.
+def flight_ends(x, drift, ends, share):
+    """How many steps from the first on follow the drift, and what share of all steps does.
 
-    x : (n, w, T); drift : (w,) a step; ends : (n,) int64 out, T where all do
+    x : (n, w, T); drift : (w,) a step; ends : (n,) int64 out, T where all do; share : (n,) out
     """
     bodies, width, steps = x.shape
     largest = 0.0
@@ -128,24 +129,27 @@ def flight_ends(x, drift, ends):
         largest = max(largest, abs(drift[c]))
     for i in range(bodies):
         ends[i] = steps
+        follow = 0
         for t in range(1, steps):
             far = False
             for c in range(width):
                 far = far or abs(x[i, c, t] - x[i, c, t - 1] - drift[c]) > 0.5 * largest
             if far:
-                ends[i] = t
-                break
+                ends[i] = min(ends[i], t)
+            else:
+                follow += 1
+        share[i] = follow / max(steps - 1, 1)
 
 
 @jit
-def choose_paths(x, guide, start, drift, step, weight, prices, flags, maximum, ends, r):
+def choose_paths(x, guide, start, drift, step, weight, prices, flags, maximum, ends, share, r):
     """Integer paths of all bodies, and how far each one follows the drift.
 
     x : (n, w, T); guide : (n, w, T) predictions on top of start, or (0, w, T) for none;
     start, drift : (w,); step, maximum [unit of x]; weight : cost [step^2] of a bit;
     prices : (w, LEVELS + 1, 2 SPAN + 1) bits; flags : (3,) bits for ends = 0, between, T;
-    ends : (n,) int64, in the step from which each body might not follow the drift, out what is
-    chosen of 0, this and T; r : (n, w, T) int64 out
+    ends, share : (n,) of `flight_ends`; ends out: what is chosen of 0, this and T;
+    r : (n, w, T) int64 out
     """
     bodies, width, steps = x.shape
     back = np.empty((steps, 2), np.int64)
@@ -153,30 +157,49 @@ def choose_paths(x, guide, start, drift, step, weight, prices, flags, maximum, e
     offset = np.zeros(steps)
     others = np.zeros(steps, np.int64)
     trial = np.empty((width, steps), np.int64)
-    flying = False
-    for c in range(width):
-        flying = flying or drift[c] != 0.0
+    # Components before the first one with a drift have the same path in every attempt.
+    drifting = 0
+    while drifting < width and drift[drifting] == 0.0:
+        drifting += 1
     for i in range(bodies):
         best = np.inf
         found = 0
+        common = 0.0
+        begun = False
         for attempt in range(3):
             end = 0 if attempt == 0 else (steps if attempt == 1 else ends[i])
-            if attempt > 0 and (not flying or (attempt == 2 and (end < 3 or end == steps))):
+            if drifting == width:
+                if attempt > 0:
+                    continue
+            elif (
+                (attempt == 0 and ends[i] == steps)
+                or (attempt == 1 and share[i] < 0.5)
+                or (attempt == 2 and (end < 3 or end == steps))
+            ):
                 continue
             cost = weight * flags[0 if attempt == 0 else (2 if attempt == 1 else 1)]
-            for c in range(width):
+            if begun:
+                cost += common
+            for c in range(drifting if begun else 0, width):
                 for t in range(steps):
                     offset[t] = start[c] + drift[c] * min(t, max(end - 1, 0))
-                    if len(guide):
-                        offset[t] += guide[i, c, t]
                     others[t] = 0
-                    for d in range(c):
-                        others[t] += 8 * min(abs(trial[d, t]), CAP)
-                        if t > 1:
-                            others[t] += 4 * min(abs(trial[d, t - 1]), CAP)
-                cost += _path(
+                if len(guide):
+                    for t in range(steps):
+                        offset[t] += guide[i, c, t]
+                for d in range(c):
+                    before = 0
+                    for t in range(steps):
+                        size = min(abs(trial[d, t]), CAP)
+                        others[t] += 8 * size + before
+                        before = 4 * size if t > 0 else 0
+                price = _path(
                     x[i, c], offset, step, weight, prices[c], others, maximum, trial[c], back, base
                 )
+                cost += price
+                if c < drifting:
+                    common += price
+            begun = True
             if cost < best:
                 best = cost
                 found = end
@@ -326,11 +349,41 @@ def class_of(before, after):
 
 
 @jit
-def shifts(residual, following, table, out):
-    """What each entry is moved by from its level [step], by class.
+def reconstruct(guide, start, drift, step, table, ends, r, steps, out):
+    """Values from residuals: start + drift min(t, end - 1) + guide + step (q + shift).
 
-    residual, following : (k,) int64; table : (5,); out : (k,) float64
+    guide : (n, w, T) or (0, w, T); start, drift : (w,); table : (5,) shifts by class;
+    ends : (n,); r : (T', w, n) int64, of one step more than asked for unless that is the last;
+    out : (steps, n, w). Single operations in this order: the bits are part of the format.
     """
-    for i in range(len(residual)):
-        kind = class_of(residual[i], following[i])
-        out[i] = table[kind] if kind >= 0 else -table[-kind]
+    known, width, bodies = r.shape
+    q = np.zeros((width, bodies), np.int64)
+    for t in range(steps):
+        for i in range(bodies):
+            flown = min(t, max(ends[i] - 1, 0))
+            for c in range(width):
+                q[c, i] += r[t, c, i]
+                after = r[t + 1, c, i] if t + 1 < known else 0
+                kind = class_of(r[t, c, i] if t > 0 else 0, after)
+                level = q[c, i] + (table[kind] if kind >= 0 else -table[-kind])
+                offset = start[c] + drift[c] * flown
+                if len(guide):
+                    offset += guide[i, c, t]
+                out[t, i, c] = offset + step * level
+
+
+@jit
+def deviation(values, decoded, unit):
+    """Sum of squares [unit^2], and largest, of the differences of two (T, n, w) arrays."""
+    largest = 0.0
+    squares = 0.0
+    for t in range(values.shape[0]):
+        # Sums by step stay short, which keeps rounding errors far below a bound.
+        part = 0.0
+        for i in range(values.shape[1]):
+            for c in range(values.shape[2]):
+                e = abs(np.float64(values[t, i, c]) - np.float64(decoded[t, i, c]))
+                largest = max(largest, e)
+                part += (e / unit) * (e / unit)
+        squares += part
+    return squares, largest

@@ -69,7 +69,7 @@ class Writer:
     def symbols(self, values: NDArray, table: NDArray) -> None:
         """Range code `values` (n,) in [0, len(table)) with weights `table`."""
         if len(table) > 1 and len(values):
-            self.coder.encode(values.astype(np.int32), models.Categorical(table, perfect=False))
+            self.coder.encode(values.astype(np.int32, copy=False), models.Categorical(table, perfect=False))
 
     def bits(self, values: NDArray, width: int) -> None:
         """Range code `values` (n,) uint64 below 2^width, all equally likely."""

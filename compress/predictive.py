@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compress import _kernels_predictive as kernels
-from compress.bounds import Target, measure
+from compress.bounds import Target
 from compress.entropy import (
     LAST_BUCKET,
     LIMIT,
@@ -110,13 +110,15 @@ def encode(
     if not np.isfinite(values).all():
         where = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
         raise ValueError(f"value at (step, body, component) = {where} is not finite")
-    raw = _encode_raw(values)
     if not values.size:
-        return raw
+        return _encode_raw(values)
     x = np.ascontiguousarray(values.transpose(1, 2, 0), dtype=np.float64)
     ahead = _predictions(values.shape, guide, start)
     coded = _encode_paths(values, x, ahead, target)
-    return raw if coded is None or len(coded) >= len(raw) else coded
+    if coded is None or len(coded) > 0.8 * values.nbytes:
+        raw = _encode_raw(values)
+        return raw if coded is None or len(raw) < len(coded) else coded
+    return coded
 
 
 def decode(
@@ -212,13 +214,13 @@ def _try(x, ahead, start, drift, step: float, search: _Search) -> _Trial:
     drift = np.rint(drift / unit_drift) * unit_drift
     # Where it does not leave the level, it is no drift.
     drift = np.where(np.abs(drift) * steps > 0.5 * step, drift, 0.0)
-    ends = np.zeros(bodies, np.int64)
+    ends, share = np.zeros(bodies, np.int64), np.zeros(bodies)
     if drift.any():
-        kernels.flight_ends(x, drift, ends)
+        kernels.flight_ends(x, drift, ends, share)
     residuals = np.empty(x.shape, np.int64)
     kernels.choose_paths(
         x, ahead, start, drift, step, search.weight, search.prices, search.flags,
-        search.maximum, ends, residuals,
+        search.maximum, ends, share, residuals,
     )  # fmt: skip
     sums = np.zeros((5, 3))
     kernels.centroid_sums(x, ahead, start, drift, step, ends, residuals, sums)
@@ -272,15 +274,17 @@ def _meet(values, x, ahead, start, drift, trial: _Trial, target: Target, cap) ->
         trial = _try(x, ahead, start, drift, step, search)
         residuals = np.ascontiguousarray(trial.residuals.transpose(2, 1, 0))
         decoded = _reconstruct(trial.layout, residuals, ahead, len(values)).astype(values.dtype)
-        errors = measure(values, decoded)
-        if target.met_by(errors):
+        squares, maximum = kernels.deviation(values, decoded, trial.layout.step)
+        frobenius = math.sqrt(squares) * trial.layout.step
+        # What is measured elsewhere may be summed in another order.
+        if frobenius <= (1.0 - 1e-12) * target.frobenius and maximum <= target.maximum:
             best, lowest = (trial.layout, residuals), step
-            if errors.frobenius >= USED * target.frobenius or target.frobenius == math.inf:
+            if frobenius >= USED * target.frobenius or target.frobenius == math.inf:
                 break
         else:
             highest = step
-        ratio = target.frobenius / errors.frobenius if errors.frobenius > 0.0 else 2.0
-        if errors.maximum > target.maximum:
+        ratio = target.frobenius / frobenius if frobenius > 0.0 else 2.0
+        if maximum > target.maximum:
             ratio = min(ratio, 0.9)
         step = min(step * min(max(0.996 * ratio, 0.5), 2.0), cap)
         if not lowest < step < highest:
@@ -551,22 +555,11 @@ def _send(runs, symbols):
 
 def _reconstruct(layout: Layout, residuals: NDArray, ahead: NDArray, steps: int) -> NDArray:
     """The first `steps` values, (steps, n, w). residuals : (steps + 1 unless the end, w, n)."""
-    total, bodies, width = layout.shape
-    out = np.empty((steps, bodies, width))
-    level = np.zeros((width, bodies), np.int64)
-    shift = np.empty(width * bodies)
-    nothing = np.zeros(width * bodies, np.int64)
-    flown = np.maximum(layout.ends - 1, 0)
-    for t in range(steps):
-        level += residuals[t]
-        before = residuals[t].ravel() if t > 0 else nothing
-        after = residuals[t + 1].ravel() if t + 1 < total else nothing
-        kernels.shifts(before, after, layout.shifts, shift)
-        offset = layout.drift[:, None] * np.minimum(t, flown)
-        offset += layout.start[:, None]
-        if len(ahead):
-            offset += ahead[:, :, t].T
-        out[t] = (offset + layout.step * (level + shift.reshape(level.shape))).T
+    out = np.empty((steps, *layout.shape[1:]))
+    kernels.reconstruct(
+        ahead, layout.start, layout.drift, layout.step, layout.shifts, layout.ends, residuals,
+        steps, out,
+    )  # fmt: skip
     return out
 
 
