@@ -52,6 +52,10 @@ class Bytes:
         self._at += count
         return self._data[self._at - count : self._at]
 
+    def peek(self) -> bytes:
+        """All bytes that are left, which stay to be read."""
+        return self._data[self._at :]
+
     def rest(self) -> bytes:
         """All bytes that are left."""
         return self.take(len(self._data) - self._at)

@@ -6,7 +6,8 @@ times how much larger than expected the row has been until now, on a scale of ha
 whether the two entries before it vanish. Every decision (zero? sign, length in bits, leading bits)
 is a binary one with an adaptive probability, and goes to a range coder.
 
-A decoder's arithmetic is on integers alone, so every machine reads what another one wrote.
+What a decoder has to repeat is arithmetic of integers, and one product and quotient of IEEE
+numbers, so that every machine reads what another one wrote.
 
 Symbols: q entry, v = |q|, p probability of a 1 [2^-16], m mean magnitude of a column, a magnitude
 seen in this row and e magnitude expected there, both with a weight that fades from column to
@@ -24,6 +25,7 @@ P_ONE = 1 << P_BITS
 P_LEAST = 24  # no decision is ever surer than this [2^-16]
 MEMORY = 120  # decisions over which a probability is taken
 PRIOR = 4  # decisions for which the first guess of a probability counts
+RATES = 2 * P_ONE // (2 * np.arange(MEMORY + 1) + 3)  # weights of the next decision [2^-16]
 TOP = 1 << 48  # the coder's interval is at most so wide, and at least TOP >> 8
 BYTE = 40  # bits below the coder's next byte
 
@@ -73,7 +75,7 @@ def _within(ratio):
 @jit
 def _level(m, a, e):
     """Half octaves of the magnitude to expect, from 0 to LEVELS - 1."""
-    x = m * (a + START) // (e + START) >> 4
+    x = int(float(m) * float(a + START) / float(16 * (e + START)))
     if x < 2:
         return 0
     level = 1
@@ -87,7 +89,7 @@ def _level(m, a, e):
 def _adapt(p, seen, context, bit):
     """Let a probability follow a decision, the first few quickly."""
     count = seen[context]
-    value = p[context] + 2 * ((bit << P_BITS) - p[context]) // (2 * count + 3)
+    value = p[context] + (((bit << P_BITS) - p[context]) * RATES[count] >> P_BITS)
     p[context] = min(max(value, P_LEAST), P_ONE - P_LEAST)
     if count < MEMORY:
         seen[context] = count + 1
@@ -159,19 +161,13 @@ def _bits(p, costs, zero, length, v):
 
 @jit
 def _choose(size, price, p, costs, zero, length):
-    """The magnitude for |x| = size: least (size - v)^2 + price * bits."""
+    """The magnitude for |x| = size, or the one below it: least (size - v)^2 + price * bits."""
     v = int(size + 0.5)
-    if price == 0.0 or v == 0 or v > 8:
+    # Beyond these no saving of bits makes up for the error.
+    if price == 0.0 or v == 0 or v > 8 or size - v > (0.4 if v == 1 else -0.2):
         return v
-    below = int(size)
-    best = size * size + price * _bits(p, costs, zero, length, 0)
-    v = 0
-    for trial in range(max(below, 1), below + 2):
-        cost = (size - trial) ** 2 + price * _bits(p, costs, zero, length, trial)
-        if cost < best:
-            best = cost
-            v = trial
-    return v
+    saved = _bits(p, costs, zero, length, v) - _bits(p, costs, zero, length, v - 1)
+    return v - 1 if (size - v + 1.0) ** 2 < (size - v) ** 2 + price * saved else v
 
 
 @jit

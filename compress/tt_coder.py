@@ -17,9 +17,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from compress import tt_natural
+from compress import tt_natural, tt_tensorised
 from compress._bytes import Bytes, number
-from compress.bounds import Target, measure, norm
+from compress.bounds import Target, measure
+from compress.step_search import CLOSE, SEEK
 
 Form = Literal["natural", "tensorised"]
 Wanted = slice | NDArray | None
@@ -28,6 +29,8 @@ RAW, NATURAL, TENSORISED, SECTIONS = range(4)
 SINGLE = 16  # flag of float32
 LIMIT = 1 << 31  # entries of a block
 
+LAST_ROUNDING = 0.9  # share of the target that leaves room for rounding to float32
+TRIALS = 4  # of the tensorised form
 SECTION_COLUMNS = 512  # blocks of more T w are coded in sections of time
 
 
@@ -72,16 +75,20 @@ def encode(
 
     Raises ValueError for values of another type or number of dimensions, and for NaN and infinity.
     """
+    if form not in ("natural", "tensorised"):
+        raise ValueError(f"form {form!r}: must be natural or tensorised")
     values = np.asarray(values)
     _check(values)
     raw = Header(RAW, values.dtype, values.shape).pack() + _little(values).tobytes()
     if target.exact or not values.size:
         return raw
     steps, _, width = values.shape
-    if form == "natural" and steps * width > SECTION_COLUMNS and steps > 1:
+    if form == "tensorised" and measure(values, 0.0 * values).frobenius > target.frobenius:
+        coded = _encode_tensorised(values, target, order)
+    elif steps * width > SECTION_COLUMNS and steps > 1:
         coded = _encode_sections(values, target)
     else:
-        coded = _encode_whole(values, target, order, form)
+        coded = _encode_natural(values, target)
     return raw if coded is None or len(coded) >= len(raw) else coded
 
 
@@ -114,7 +121,7 @@ def decode(
     if header.mode == NATURAL:
         decoded = tt_natural.decode(source, header.shape, chosen_steps, chosen_bodies)
     else:
-        raise ValueError("coded block: of no known kind")
+        decoded = tt_tensorised.decode(source, header.shape, order, chosen_steps, chosen_bodies)
     with np.errstate(over="ignore", under="ignore"):
         return decoded.astype(header.dtype)
 
@@ -145,27 +152,44 @@ def _indices(wanted: Wanted, length: int) -> NDArray:
     return every if wanted is None else every[wanted]
 
 
-def _encode_whole(
-    values: NDArray, target: Target, order: NDArray | None, form: Form
-) -> bytes | None:
-    """One train for the block; None if that does not pay or cannot meet the target."""
-    header = Header(NATURAL, values.dtype, values.shape)
-    if form != "natural":
-        raise ValueError(f"form {form!r}: must be natural or tensorised")
-    for goal in (target, _tighter(target)):
-        # Searched for on scaled float64 values; the last word is that of a decoder.
+def _encode_natural(values: NDArray, target: Target) -> bytes | None:
+    """A train of two cores; None if that does not pay or cannot meet the target."""
+    head = Header(NATURAL, values.dtype, values.shape).pack()
+    for share in (1.0, LAST_ROUNDING):
+        # The search sees the values as float64 scaled by a power of two.
+        goal = Target(share * target.frobenius, share * target.maximum)
         code = tt_natural.encode(values, goal)
         if code is None:
             return None
-        coded = header.pack() + code
-        if target.met_by(measure(values, decode(coded, order))):
-            return coded
+        if _is_plain(values) or target.met_by(measure(values, decode(head + code))):
+            return head + code
     return None
 
 
-def _tighter(target: Target) -> Target:
-    """The target less what the last rounding of the values may add."""
-    return Target(0.9 * target.frobenius, 0.9 * target.maximum)
+def _encode_tensorised(values: NDArray, target: Target, order: NDArray | None) -> bytes | None:
+    """A train of many cores; None likewise."""
+    head = Header(TENSORISED, values.dtype, values.shape).pack()
+    # Pointwise errors are spread about as those of independent numbers.
+    frobenius = min(target.frobenius, 0.25 * target.maximum * math.sqrt(values.size))
+    best = None
+    for _ in range(TRIALS):
+        code = tt_tensorised.encode(values, order, Target(frobenius))
+        if code is None or len(code) >= values.nbytes:
+            break
+        errors = measure(values, decode(head + code, order))
+        excess = max(errors.frobenius / target.frobenius, errors.maximum / target.maximum)
+        if excess <= 1.0 and (best is None or len(code) < len(best)):
+            best = code
+        if CLOSE <= excess <= 1.0:
+            break
+        frobenius *= min(max(SEEK / max(excess, 1e-30), 0.2), 2.0)
+    return None if best is None else head + best
+
+
+def _is_plain(values: NDArray) -> bool:
+    """Whether scaling by powers of two is exact and nothing is rounded to another type."""
+    exponent = math.frexp(float(np.abs(values).max()))[1]
+    return values.dtype == np.float64 and abs(exponent) < 900
 
 
 def _encode_sections(values: NDArray, target: Target) -> bytes | None:

@@ -25,16 +25,11 @@ from compress._bytes import Bytes, number, signed
 from compress._kernels_context import combine
 from compress.bounds import Target
 from compress.quantise import PRICE, Rounded, round_matrix, shift_values, unround
+from compress.step_search import FIRST_OCTAVE, MET, Seeker, scaled_target, step_size
 
 SAMPLE = 2048  # bodies on which the step is sought first
 FEW = 1024  # bodies by which it is decided whether there is a common trajectory
 PASSES = 8  # trials of a step on the whole block
-CLOSE = 0.985  # share of the target with which the search ends
-SEEK = 0.993  # share it aims at
-
-STEP_PARTS = 1 << 10  # a step is one of so many in an octave
-FIRST_OCTAVE = -60  # of the smallest step, the largest value of the block being near 1
-STEPS = 64 * STEP_PARTS
 
 
 @dataclass(frozen=True)
@@ -63,8 +58,7 @@ def encode(values: NDArray, target: Target) -> bytes | None:
     exponent = math.frexp(float(np.abs(values).max()))[1]
     X = np.ldexp(np.asarray(values, np.float64).transpose(1, 0, 2), -exponent)
     X = np.ascontiguousarray(X).reshape(n, T * width)
-    goal = Target(_scaled(target.frobenius, exponent), _scaled(target.maximum, exponent))
-    block = _Block(X, width, goal, values.nbytes)
+    block = _Block(X, width, scaled_target(target, exponent), values.nbytes)
     code = block.search()
     return None if code is None else code.pack(exponent)
 
@@ -94,29 +88,6 @@ def decode(
         return np.ldexp(np.ascontiguousarray(y), exponent)
 
 
-def step_size(code: int) -> float:
-    """The step with this number, exact: 2^octave (1 + part / STEP_PARTS)."""
-    octave, part = divmod(code, STEP_PARTS)
-    return math.ldexp(1.0 + part / STEP_PARTS, octave + FIRST_OCTAVE)
-
-
-def step_code(step: float) -> int:
-    """The number of the largest step that is not above this one, within the range there is."""
-    if step <= 0.0:
-        return 0
-    fraction, octave = math.frexp(step)
-    code = (octave - 1 - FIRST_OCTAVE) * STEP_PARTS + int((2.0 * fraction - 1.0) * STEP_PARTS)
-    return min(max(code, 0), STEPS - 1)
-
-
-def _scaled(error: float, exponent: int) -> float:
-    """An allowed error in units of 2^exponent; infinite where it is beyond all values."""
-    try:
-        return math.ldexp(error, -exponent)
-    except OverflowError:
-        return math.inf
-
-
 def _restore_cores(q: NDArray, step: float, n: int, width: int) -> tuple[NDArray, NDArray]:
     """step * V (r, c) and m (c,) of the integers (1 + r, c) of the core of time."""
     p = basis.polynomials(q.shape[1] // width)
@@ -137,7 +108,7 @@ def _singular(Y: NDArray) -> tuple[NDArray, NDArray]:
         _, s, V = np.linalg.svd(Y, full_matrices=False)
         return V, s
     squares, V = np.linalg.eigh(Y.T @ Y)
-    return V[:, ::-1].T, np.sqrt(np.maximum(squares[::-1], 0.0))
+    return np.ascontiguousarray(V.T[::-1]), np.sqrt(np.maximum(squares[::-1], 0.0))
 
 
 def _bits(Y: NDArray, step: float) -> float:
@@ -173,18 +144,18 @@ class _Block:
         n = len(self.X)
         step = self._first_step()
         if n >= 2 * SAMPLE:
-            trial = _Seeker(step)
+            trial = Seeker(step)
             for _ in range(3):
                 code = self.code(trial.step, slice(None, None, n // SAMPLE))
                 if code is None or trial.learn(code.excess):
                     break
             step = step_size(trial.step)
-        trial, best = _Seeker(step), None
+        trial, best = Seeker(step), None
         for _ in range(PASSES):
             code = self.code(trial.step)
             if code is None:
                 break
-            if code.excess <= 1.0 and (best is None or code.step > best.step):
+            if code.excess <= MET and (best is None or code.step > best.step):
                 best = code
             if trial.learn(code.excess):
                 break
@@ -242,35 +213,6 @@ class _Block:
         for _ in range(14):
             middle = 0.5 * (low + high)
             step = 2.0**middle
-            squares = float(np.where(U < 0.65 * step, U * U, step * step / 12.0).sum())
+            squares = float(np.where(0.65 * step > U, U * U, step * step / 12.0).sum())
             low, high = (low, middle) if squares > allowed else (middle, high)
         return min(2.0**low, 0.7 * self.target.maximum)
-
-
-class _Seeker:
-    """Finds the step whose error is just below the target, from one trial to the next."""
-
-    def __init__(self, step: float) -> None:
-        self.step = step_code(step)
-        self._kept, self._broken = -1, STEPS  # largest step that met the target, smallest not
-        self._last: tuple[float, float] | None = None
-        self._slope = 0.8  # d ln(error) / d ln(step), of the last two trials
-
-    def learn(self, excess: float) -> bool:
-        """Take in the error of `step` over the target and choose the next; True at the end."""
-        if CLOSE <= excess <= 1.0:
-            return True
-        if excess <= 1.0:
-            self._kept = max(self._kept, self.step)
-        else:
-            self._broken = min(self._broken, self.step)
-        here = math.log(step_size(self.step)), math.log(max(excess, 1e-30))
-        if self._last is not None and here[0] != self._last[0]:
-            slope = (here[1] - self._last[1]) / (here[0] - self._last[0])
-            self._slope = min(max(slope, 0.3), 2.0)
-        self._last = here
-        if self._broken - self._kept <= 1:
-            return True
-        wanted = step_code(math.exp(here[0] + (math.log(SEEK) - here[1]) / self._slope))
-        self.step = min(max(wanted, self._kept + 1), self._broken - 1)
-        return False
