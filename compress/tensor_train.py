@@ -166,13 +166,13 @@ class TensorTrain:
         columns = [_checked(indices[:, k], n, k) for k, n in enumerate(self.shape)]
         values = np.empty(indices.shape[0], dtype=self.dtype)
         block = max(1, _ENTRIES_AT_ONCE // max(a * b for a, b in pairwise(self.ranks)))
-        tamed = [_tamed(core) for core in self.cores]
         for start in range(0, values.size, block):
             rows = slice(start, start + block)
             product = np.ones((values[rows].size, 1, 1), dtype=self.dtype)
             exponent = 0
-            for (core, shift), column in zip(tamed, columns, strict=True):
-                product, more = _tamed(product @ core.transpose(1, 0, 2)[column[rows]])
+            for core, column in zip(self.cores, columns, strict=True):
+                matrices, shift = _tamed(core.transpose(1, 0, 2)[column[rows]])
+                product, more = _tamed(product @ matrices)
                 exponent += shift + more
             values[rows] = np.ldexp(product[:, 0, 0], exponent)
         return values
@@ -321,12 +321,15 @@ def _block_diagonal(
 def _hadamard(a: TensorTrain, b: TensorTrain) -> TensorTrain:
     """Entry by entry: each matrix is the Kronecker product of two."""
     _check_same_shape(a, b)
-    return _train(
-        np.einsum("inj,knl->iknjl", x, y).reshape(
-            x.shape[0] * y.shape[0], x.shape[1], x.shape[2] * y.shape[2]
-        )
-        for x, y in zip(a.cores, b.cores, strict=True)
-    )
+    cores, exponent = [], 0
+    for x, y in zip(a.cores, b.cores, strict=True):
+        x, x_exponent = normalized(x)
+        y, y_exponent = normalized(y)
+        product = np.einsum("inj,knl->iknjl", x, y)
+        ranks = x.shape[0] * y.shape[0], x.shape[2] * y.shape[2]
+        cores.append(product.reshape(ranks[0], x.shape[1], ranks[1]))
+        exponent += x_exponent + y_exponent
+    return scaled(_train(cores), exponent)
 
 
 def _times(train: TensorTrain, factor: float) -> TensorTrain:
@@ -391,7 +394,8 @@ def _triangle(matrix: NDArray) -> NDArray:
 
 
 def _exponent(values: NDArray) -> int:
-    return math.frexp(float(np.abs(values).max(initial=0.0)))[1]
+    largest = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
+    return math.frexp(largest)[1]
 
 
 def _from_scaled(mantissa: float, exponent: int) -> float:
