@@ -22,7 +22,7 @@ Parts:
 A measurement is a process of its own, kept under build/bench/compress by version of the package:
 what is there is not measured again, and records are made of all that is there. The run, and what
 rivals make of it, are kept for all versions. --dry measures nothing; --quick takes a quarter of the
-bodies and every third chunk. --page puts the tables between the markers of Markdown files.
+bodies, every third chunk and no angular velocities. --page puts the tables between the markers of Markdown files.
 """
 
 from __future__ import annotations
@@ -76,10 +76,11 @@ def pieces(quick: bool) -> list[Piece]:
         add("sediment", f"velocity-{tau:.0e}", kind="archive", fields=["velocity"], tau=tau)
     for tau in TAUS:
         add("sediment", f"trains-{tau:.0e}", kind="trains", tau=tau)
+    others = (["velocity", "position"], ["angular_velocity"])
     for tau in TAUS:
-        for fields in (["angular_velocity"], ["velocity", "position"]):
+        for fields in others[: 1 if quick else 2]:
             add("sediment", f"{fields[-1]}-{tau:.0e}", kind="archive", fields=fields, tau=tau)
-    for tau in TAUS:
+    for tau in TAUS[: 1 if quick else 3]:
         add("thesis", f"{tau:.0e}", kind="thesis", tau=tau)
     for form in ("natural", "tensorised"):
         add("thesis", f"streamed-{form}", kind="streamed", tau=TAUS[0], form=form)

@@ -58,7 +58,8 @@ def streamed(run: Sediment, tau: float, form: str) -> list[dict[str, Any]]:
     from compress.stream import TensorTrainStream
 
     natural = form != "tensorised"
-    stream = TensorTrainStream(tau, axis=1 if natural else 14, form=JOINED[natural])
+    levels = run.bodies.bit_length() - 1
+    stream = TensorTrainStream(tau, axis=1 if natural else levels, form=JOINED[natural])
     rows, count = [], 0
     for chunk in run.chunks:
         found = run.load(chunk, ("velocity", "position"))
