@@ -80,6 +80,9 @@ def round_train(
     if train.dtype == np.float32:
         fixed += train.ndim * _U32 * sweep.norm
     cores, dropped = _truncated(sweep.cores, max(allowed - fixed, fixed), caps)
+    if any(core.shape[0] > core[0].size for core in cores):
+        # A bond next to a short dimension that was cut less than the one behind it.
+        cores, _ = _truncated(_right_orthogonal(cores), 0.0, caps)
 
     norm = _ldexp(sweep.norm, sweep.exponent)
     if all(new.shape == old.shape for new, old in zip(cores, train.cores, strict=True)):
@@ -143,11 +146,11 @@ class _Sweep:
     being that of sums whose rounding errors are independent (N. J. Higham and T. Mary, SIAM J.
     Sci. Comput. 41, 2019), and row j meets column l_j of the product of the cores on its left:
 
-        noise^2 = sum_k (4 u)^2 n_k r_k (sum_j ||l_j||^2 ||m_j||^2 + ||X||^2),
+        noise^2 = sum_k (4 u)^2 n_k r_k (sum_j ||l_j||^2 ||m_j||^2 + 3 ||X||^2),
 
     which holds for trains that are small differences of large ones too. ||l_j||^2 is the diagonal
-    of the Gram matrix of the left cores. The second term is that of the truncations, whose
-    matrices have the norm of X.
+    of the Gram matrix of the left cores. The second term is that of the truncations and of two
+    sweeps that may follow, whose matrices have the norm of X.
     """
 
     cores: tuple[NDArray, ...]
@@ -178,11 +181,24 @@ def _orthogonalized(train: TensorTrain) -> _Sweep:
     terms.append((norm, shift, cores[0].size))
     noise = math.hypot(
         *(
-            _STEP * _U * math.sqrt(length) * math.hypot(_ldexp(value, e - shift), norm)
+            _STEP
+            * _U
+            * math.sqrt(length)
+            * math.hypot(_ldexp(value, e - shift), math.sqrt(3.0) * norm)
             for value, e, length in terms
         )
     )
     return _Sweep(tuple(cores), exponent + shift, norm, noise)
+
+
+def _right_orthogonal(cores: Sequence[NDArray]) -> list[NDArray]:
+    """The same tensor with orthonormal rows in all cores but the first."""
+    cores = list(cores)
+    for k in range(len(cores) - 1, 0, -1):
+        q, r = _lq(cores[k].reshape(cores[k].shape[0], -1))
+        cores[k] = q.reshape(q.shape[0], *cores[k].shape[1:])
+        cores[k - 1] = cores[k - 1] @ r
+    return cores
 
 
 def _lq(matrix: NDArray) -> tuple[NDArray, NDArray]:
