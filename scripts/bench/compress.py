@@ -21,8 +21,9 @@ Parts:
 
 A measurement is a process of its own, kept under build/bench/compress by version of the package:
 what is there is not measured again, and records are made of all that is there. The run, and what
-rivals make of it, are kept for all versions. --dry measures nothing; --quick takes a quarter of the
-bodies, every third chunk and no angular velocities. --page puts the tables between the markers of Markdown files.
+rivals make of it, are kept for all versions. --dry measures nothing; --quick takes a quarter
+of the bodies, every third chunk and no angular velocities. --page puts the tables between the
+markers of Markdown files.
 """
 
 from __future__ import annotations

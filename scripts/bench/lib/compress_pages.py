@@ -238,16 +238,26 @@ def _thesis_table(known: Known, bodies: int) -> str:
 
 
 def _ttsvd_table(records: Sequence[Any]) -> str:
-    lines = []
-    for record in records:
-        if record.name.startswith("compress.ttsvd") and record.unit == "s":
+    """Ours, by the method that it chose and by each, and the rivals."""
+    found = [record for record in records if record.name.startswith("compress.ttsvd")]
+    lines, ours = [], math.nan
+    for record in found:
+        if record.name.startswith("compress.ttsvd_seconds"):
             if not lines:
-                lines.append(["ours", number(record.value), number(record.error, 2), "1"])
+                ours = record.value
+                methods = ", ".join(record.params["methods"])
+                lines.append([f"ours ({methods})", number(ours), "1", number(record.error, 2),
+                              f"{record.params['parameters']:,}"])  # fmt: skip
             if record.rival:
-                error = record.params.get("rival_error")
-                lines.append([record.rival, number(record.rival_value), number(error, 2),
-                              number(record.rival_value / record.value)])  # fmt: skip
-    return _markdown(["", "CPU seconds", "error", "times ours"], lines)
+                params = record.params
+                lines.append([record.rival, number(record.rival_value),
+                              number(record.rival_value / ours), number(params["rival_error"], 2),
+                              f"{params['rival_parameters']:,}"])  # fmt: skip
+        else:
+            method = record.name.removeprefix("compress.ttsvd_").removesuffix("_seconds")
+            lines.append([f"ours, {method}", number(record.value), number(record.value / ours),
+                          number(record.error, 2), f"{record.params['parameters']:,}"])  # fmt: skip
+    return _markdown(["", "CPU seconds", "times ours", "error", "numbers"], lines)
 
 
 def _precision_table(known: Known, bodies: int) -> str:
@@ -270,14 +280,13 @@ def _precision_table(known: Known, bodies: int) -> str:
 def _stress_table(known: Known) -> str:
     lines = []
     for _, rows in chosen(known, "stress"):
-        fields = dict.fromkeys(row["field"] for row in rows)
-        for field in fields:
-            of = {row["tau"]: row for row in rows if row["field"] == field}
+        for variable in dict.fromkeys(row["variable"] for row in rows):
+            of = {row["tolerance"]: row for row in rows if row["variable"] == variable}
             cells = [
-                f"{of[tau]['rank']} · {number(of[tau]['ratio'])} · {number(of[tau]['nrmse'], 2)}"
-                if tau in of else "–" for tau in TAUS
-            ]  # fmt: skip
-            lines.append([_words(field), *cells])
+                f"{row['largest_rank']} · {number(row['ratio'])} · {number(row['nrmse'], 2)}"
+                for row in (of[tau] for tau in TAUS)
+            ]
+            lines.append([_words(variable), *cells])
     return _markdown(["largest rank · ratio · nRMSE", *map(_tolerance, TAUS)], lines)
 
 

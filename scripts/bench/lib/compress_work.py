@@ -22,6 +22,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from statistics import median
 from time import perf_counter, process_time
@@ -29,7 +30,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from lib.compress_data import SCENE, STEP, STEPS, Sediment, simulate
+from lib.compress_data import CACHE, SCENE, STEP, STEPS, Sediment, simulate
 from lib.compress_rivals import AIM, RIVALS, Point, Rivals, measured, pieces
 
 from compress.archive import Archive, ArchiveWriter, Block, Chunk, FieldSpec, Settings
@@ -345,8 +346,14 @@ def _seconds_by_phase(metrics: Path) -> dict[str, float]:
 
 
 def _ttsvd(run: Sediment, task: dict[str, Any]) -> list[dict[str, Any]]:
-    raise NotImplementedError
+    from lib.compress_ttsvd import work as do
+
+    return do(quick=run.quick, runs=task["runs"])
 
 
 def _stress(run: Sediment, task: dict[str, Any]) -> list[dict[str, Any]]:
-    raise NotImplementedError
+    from lib.compress_packings import Packings, packing_series, table
+
+    packings = Packings(volumes=4, steps=256) if run.quick else Packings()
+    series = packing_series(CACHE / f"packings-{packings.volumes}", packings)
+    return [asdict(row) for row in table(series)]
