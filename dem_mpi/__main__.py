@@ -159,13 +159,13 @@ def schema() -> None:
 @app.command(epilog=_EPILOG)
 def info(
     file: Annotated[
-        Path, typer.Argument(help="Trajectory, checkpoint or flow.", metavar="FILE.h5")
+        Path, typer.Argument(help="Trajectory, checkpoint, archive or flow.", metavar="FILE.h5")
     ],
 ) -> None:
     """Say what is in a file of a run, and whether it is valid.
 
-    FILE.h5 is a trajectory, a checkpoint or a flow; of anything else it says that (65). A run that
-    is going on may be looked at, too.
+    FILE.h5 is a trajectory, a checkpoint, an archive or a flow; of anything else it says that (65).
+    A run that is going on may be looked at, too.
     """
     from dem_mpi.output import describe
 
@@ -473,6 +473,183 @@ def flow(
     parallel = Parallel()
     parallel.install_abort_hook()
     raise typer.Exit(flow_file(parallel, run, options, _print))
+
+
+Archive = Annotated[
+    Path, typer.Argument(help="Archive that compress or a run has made.", metavar="ARCHIVE")
+]
+Fields = Annotated[
+    str | None,
+    typer.Option("--fields", metavar="NAMES", help="Only these, e.g. velocity,radius."),
+]
+Steps = Annotated[
+    str | None,
+    typer.Option(
+        "--steps", metavar="A:B", help="Only frames of steps A up to and without B. [default: all]"
+    ),
+]
+Gids = Annotated[
+    str | None,
+    typer.Option(
+        "--bodies", metavar="A:B", help="Only bodies of gid A up to and without B. [default: all]"
+    ),
+]
+
+
+@app.command(epilog=_EPILOG)
+def compress(
+    source: Annotated[
+        str,
+        typer.Argument(
+            help="Trajectory run.h5, or an array: file.npy, file.h5:/group/name.", metavar="SOURCE"
+        ),
+    ],
+    tolerance: Annotated[
+        float,
+        typer.Option(
+            "--tol",
+            help="Relative error in each chunk, Frobenius norm, of fields without a bound of their "
+            "own; what bodies keep for life (radius, shape, ...) is kept exactly.",
+        ),
+    ] = 1e-2,
+    field: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--field",
+            metavar="NAME[=BOUND]",
+            help="Only this field; BOUND is a relative error such as 1e-3, relative:X, rmse:X, "
+            "pointwise:X (in the unit of the field) or exact. May be repeated. [default: all]",
+        ),
+    ] = None,
+    chunk: Annotated[
+        int,
+        typer.Option("--chunk", help="Frames compressed together: more make a smaller file."),
+    ] = 32,
+    floor: Annotated[
+        float,
+        typer.Option(
+            "--floor",
+            help="A relative bound no longer shrinks with a chunk whose root mean square is below "
+            "this share of that of the chunks before.",
+        ),
+    ] = 0.0,
+    explain: Annotated[
+        bool,
+        typer.Option(
+            "--explain",
+            help="Say what to expect, correlations, ranks and ratios by coder, and end.",
+        ),
+    ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", metavar="ARCHIVE", help="File to write. [default: SOURCE's name .tt.h5]"
+        ),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the archive behind its last chunk.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace ARCHIVE if it exists.")] = False,
+) -> None:
+    """Compress a trajectory or an array: mpirun -n P dem-mpi compress SOURCE.
+
+    The error of what the archive holds is measured while it is written, and kept in it; dem-mpi
+    info tells it. A signal ends the program behind a chunk with 75; --resume goes on from there.
+    """
+    from dem_mpi.compress_options import CompressOptions, parse_bounds
+    from dem_mpi.parallel import Parallel
+
+    options = CompressOptions(
+        source, output, tolerance, parse_bounds(field or ()), chunk, floor, explain, resume, force
+    )
+    from dem_mpi.compress_command import compress_file
+
+    parallel = Parallel()
+    parallel.install_abort_hook()
+    compress_file(parallel, options, STOP, _print)
+
+
+@app.command(epilog=_EPILOG)
+def restore(
+    archive: Archive,
+    fields: Fields = None,
+    steps: Steps = None,
+    bodies: Gids = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            metavar="FILE",
+            help="Trajectory .h5, which ParaView opens, or arrays .npz, or one array .npy. "
+            "[default: .h5 beside ARCHIVE, .npz without position]",
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace FILE if it exists.")] = False,
+) -> None:
+    """Restore an archive, or a part of it: only that is decoded.
+
+    Where a body is not there, arrays hold NaN, and 0 for whole numbers; .npz has 'present' besides.
+    """
+    from dem_mpi.compress_options import parse_selection
+
+    selection = parse_selection(fields, steps, bodies)
+    from dem_mpi.restore_command import restore_file
+    from dem_mpi.solve import end_on_signals
+
+    end_on_signals(STOP)
+    _on_one_rank(lambda: restore_file(archive, selection, output, force, _print))
+
+
+@app.command("slice", epilog=_EPILOG)
+def slice_command(
+    archive: Archive,
+    fields: Fields = None,
+    steps: Steps = None,
+    bodies: Gids = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", metavar="FILE.csv", help="Write them there. [default: print]"),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace FILE.csv if it exists.")] = False,
+) -> None:
+    """Print some values of an archive, a line for each body and step."""
+    from dem_mpi.compress_options import parse_selection
+
+    selection = parse_selection(fields, steps, bodies)
+    from dem_mpi.restore_command import slice_file
+
+    _on_one_rank(lambda: slice_file(archive, selection, output, force, _print))
+
+
+@app.command(epilog=_EPILOG)
+def compare(
+    first: Annotated[
+        str, typer.Argument(help="Archive, trajectory, or array as for compress.", metavar="A")
+    ],
+    second: Annotated[str, typer.Argument(help="What is compared with it.", metavar="B")],
+    fields: Fields = None,
+) -> None:
+    """Say how far B is from A: errors of each field, at steps and of bodies that both have."""
+    from dem_mpi.compress_options import parse_selection
+
+    selection = parse_selection(fields, None, None)
+    from dem_mpi.restore_command import compare_files
+
+    _on_one_rank(lambda: [_print(line) for line in compare_files(first, second, selection)])
+
+
+def _on_one_rank(work) -> None:
+    """Collective. Do on rank 0 what needs no others; its error on all of them."""
+    from dem_mpi.parallel import Parallel
+
+    parallel, error = Parallel(), None
+    parallel.install_abort_hook()
+    if parallel.rank == 0:
+        try:
+            work()
+        except DemError as caught:
+            error = caught
+    parallel.raise_together(error)
 
 
 @app.command(epilog=_EPILOG)

@@ -12,7 +12,7 @@ again, with all others that came after its checkpoint, and goes on from the fram
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,15 +48,20 @@ def field_specs(bounds: Mapping[str, tuple[str, float]]) -> dict[str, FieldSpec]
     specs = {}
     for name, (kind, value) in bounds.items():
         field = FIELDS[name]
-        guide = _GUIDES.get(name)
         specs[name] = FieldSpec(
             bound=Bound(kind, value),
             dtype=np.dtype(field.dtype).str.lstrip("<=|"),
             width=field.row_shape[0] if field.row_shape else 1,
             unit=field.unit,
-            guide=guide if guide in bounds else None,
+            guide=guide_of(name, bounds),
         )
     return specs
+
+
+def guide_of(name: str, fields: Container[str]) -> str | None:
+    """The archived field whose integral over time predicts this one, None if there is none."""
+    guide = _GUIDES.get(name)
+    return guide if guide is not None and guide in fields else None
 
 
 @dataclass(frozen=True)
@@ -102,9 +107,11 @@ class ArchiveFacts:
             f"{self.frames:,} frames in {chunks} in {self.path}: {readable_size(self.coded)} for "
             f"{readable_size(self.raw)}, {self.ratio:.3g} times smaller"
         ]
-        lines += [f"  {name}: {error_text(self.errors[name], self.fields[name])}"
-                  for name in self.fields]  # fmt: skip
-        return lines
+        return lines + [f"  {line}" for line in self.field_lines()]
+
+    def field_lines(self) -> list[str]:
+        """Fields with the errors that were measured, one a line."""
+        return [f"{n}: {error_text(self.errors[n], spec)}" for n, spec in self.fields.items()]
 
     def coder_line(self) -> str:
         """Bytes by coder, the largest first."""

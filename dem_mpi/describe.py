@@ -42,6 +42,7 @@ from dem_mpi.trajectory import (
 )
 
 _FLOW = "stokes flow"  # the format that `stokes.flow_file` writes
+_ARCHIVE = "tensor archive"  # the format that `compress.archive` writes
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Description:
     """What a file holds, for people: `exit_code` is 0 if it is valid and 65 if it is not."""
 
     path: Path
-    kind: str  # "trajectory", "checkpoint", "flow" or "unknown"
+    kind: str  # "trajectory", "checkpoint", "archive", "flow" or "unknown"
     valid: bool
     reason: str  # why it is not valid, "" if it is
     size: int  # [B]
@@ -65,7 +66,7 @@ class Description:
     version: str = ""
     scene: str = ""
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()  # of a flow
+    notes: tuple[str, ...] = ()  # of an archive or a flow
 
     @property
     def exit_code(self) -> int:
@@ -78,7 +79,7 @@ class Description:
         lines = [f"{self.path}: {self.kind}, {readable_size(self.size)}, {verdict}"]
         if self.writer:
             lines.append(f"  being written by {self.writer}")
-        if self.kind in ("flow", "unknown") or not (self.frames or self.fields):
+        if self.kind in ("archive", "flow", "unknown") or not (self.frames or self.fields):
             return lines + [f"  {note}" for note in self.notes]
         if self.scene or self.version:
             lines.append(f"  scene {self.scene or '(no name)'}, by dem-mpi {self.version}")
@@ -116,9 +117,12 @@ def describe(path: Path | str, *, verify: bool = True) -> Description:
                 return _describe_trajectory(path, file, found, verify)
             if kind == _FLOW:
                 return _describe_flow(path, replace(found, kind="flow"))
+            if kind == _ARCHIVE:
+                return _describe_archive(path, replace(found, kind="archive"), verify)
             if kind != checkpoint.FORMAT:
                 raise DataError(
-                    f"{path}: neither a trajectory nor a checkpoint nor a flow of dem-mpi"
+                    f"{path}: neither a trajectory nor a checkpoint nor an archive nor a flow of "
+                    "dem-mpi"
                 )
         found = replace(found, kind="checkpoint")
         return _describe_checkpoint(path, found)
@@ -249,6 +253,48 @@ def _describe_flow(path: Path, found: Description) -> Description:
             f"{get('residual'):.2e}, tolerance {get('tolerance'):g}"
         )
     return replace(found, valid=True, complete=True, notes=tuple(notes), attributes=flow.attributes)
+
+
+def _describe_archive(path: Path, found: Description, verify: bool) -> Description:
+    """What is in an archive; all checksums are compared to `verify`, nothing is decoded."""
+    from compress.archive import Archive
+    from dem_mpi.compression import ArchiveFacts
+
+    with Archive(path) as archive:
+        if verify:
+            archive.verify()
+        steps, times, provenance = archive.steps, archive.times, archive.provenance
+        complete, bodies = archive.complete, len(archive.gid)
+        settings = archive.settings
+    facts = ArchiveFacts.of(path)
+    state = "complete" if complete else "not complete: it is being written or was interrupted"
+    notes = []
+    if "source" in provenance:
+        notes.append(f"of {provenance['source']}")
+    elif "version" in provenance:
+        name = _scene_name(provenance) or "(no name)"
+        notes.append(f"of a run of scene {name}, by dem-mpi {provenance['version']}")
+    notes.append(f"{len(steps):,} frames in {facts.chunks:,} chunks, {state}")
+    if len(steps):
+        notes.append(f"steps {steps[0]} to {steps[-1]}, t = {times[0]:.6g} to {times[-1]:.6g} s")
+    notes.append(f"{bodies:,} bodies")
+    notes += facts.field_lines()
+    if settings.floor:
+        notes.append(f"floor {settings.floor:g}")
+    if facts.raw:
+        size = f"{readable_size(facts.coded)} for {readable_size(facts.raw)}"
+        notes += [f"{size}, {facts.ratio:.3g} times smaller", facts.coder_line()]
+    return replace(
+        found,
+        valid=True,
+        complete=complete,
+        frames=len(steps),
+        bodies=(bodies, bodies),
+        steps=(int(steps[0]), int(steps[-1])) if len(steps) else (0, 0),
+        times=(float(times[0]), float(times[-1])) if len(steps) else (0.0, 0.0),
+        notes=tuple(notes),
+        attributes=provenance,
+    )
 
 
 def _scene_name(attributes: Mapping[str, Any]) -> str:

@@ -113,13 +113,22 @@ class FrameBuffer:
 
 
 def tracks(frames: int, rows: Mapping[str, NDArray]) -> Track:
-    """Sort rows (m,) of so many frames by body; at most one row of a body in a frame."""
+    """Sort rows (m,) of so many frames by body.
+
+    Raises ValueError where a body has two rows in a frame, or none between its first and its last.
+    """
     frame = rows["frame"]
     gid, body = np.unique(rows["gid"], return_inverse=True)
     first = np.full(len(gid), frames, np.int32)
     stop = np.zeros(len(gid), np.int32)
     np.minimum.at(first, body, frame)
     np.maximum.at(stop, body, frame + 1)
+    rows_of = np.bincount(body, minlength=len(gid))
+    there = np.zeros((frames, len(gid)), bool)
+    there[frame, body] = True
+    wrong = np.flatnonzero((rows_of != stop - first) | (there.sum(axis=0) != rows_of))
+    if len(wrong):
+        raise ValueError(f"body {gid[wrong[0]]} is there twice at a time, or not all the time")
     fields = {}
     for name, values in rows.items():
         if name not in ("frame", "gid"):

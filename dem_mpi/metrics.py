@@ -149,7 +149,7 @@ class Progress:
         text = (
             f"step {record['step']}/{self._steps}  t = {record['time']:.6g}/{end_time:.6g} s  "
             f"contacts {record['contacts']:,}  {_iterations(record)}  "
-            f"r_d {record['r_d']:.1e} m/s  {pace:.3g} s/step  remaining {_duration(left)}"
+            f"r_d {record['r_d']:.1e} m/s  {pace:.3g} s/step  remaining {duration(left)}"
         )
         if flagged:
             text += f"  [{flagged} steps missed the tolerance]"
@@ -206,7 +206,8 @@ class SolverCounts:
         return ["; ".join(parts)]
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """A time for people: '3 min 20 s'."""
     whole = round(seconds)
     if whole < 60:
         return f"{whole} s"
