@@ -10,7 +10,7 @@ Symbols: T steps of the chunk; n bodies of the block; w components of a field.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from compress import coders
 from compress.bounds import Bound, Errors, Target, measure, norm
+from compress.tensorize import morton_order
 from dem_mpi.errors import InputError
 
 
@@ -55,6 +56,9 @@ class Settings:
 DEFAULT_SETTINGS = Settings()
 # Bytes an entry that change by this factor from chunk to chunk call for another trial.
 JUMP = 1.5
+# Coders that take this many times the fewest bytes on a sample of bodies are not tried on all.
+PROMISING = 1.5
+SAMPLE = 1024
 
 
 @dataclass(frozen=True)
@@ -212,6 +216,7 @@ class Encoder:
         present = presence(block, len(times))
         ends = None if present is None else presence_ends(block, len(times))
         rows = len(times) * len(block.gid) if present is None else int(present.sum())
+        order = _spatial_order(block, ends)
         coded: dict[str, CodedField] = {}
         decoded: dict[str, NDArray] = {}
         for name in in_order_of_guides(self.fields):
@@ -220,8 +225,9 @@ class Encoder:
             if spec.bound.kind != "exact" and values.dtype.kind == "f":
                 _require_finite(name, values, block.gid)
             guide = None if spec.guide is None else increments(decoded[spec.guide], times)
+            context = coders.Context(guide, order)
             target = self._target(name, values.dtype, rows * spec.width, whole[name])
-            coded[name], decoded[name] = self._encode_field(name, values, target, guide, present)
+            coded[name], decoded[name] = self._encode_field(name, values, target, context, present)
         result = CodedBlock(block.gid, ends, {name: coded[name] for name in self.fields})
         self.memory = self.memory.after(result.winners, whole)
         return result
@@ -244,22 +250,24 @@ class Encoder:
         name: str,
         values: NDArray,
         target: Target,
-        guide: NDArray | None,
+        context: coders.Context,
         present: NDArray | None,
     ) -> tuple[CodedField, NDArray]:
         """The field in the fewest bytes, and what they decode to."""
-        names = coders.candidates(target, guide is not None)
+        names = coders.candidates(target, context)
         last = self.memory.winners.get(name)
-        if last is None or self.memory.chunks % self.settings.trial_every == 0:
-            return _smallest(names, values, target, guide, present)
-        if last.coder not in names:
-            return _smallest(names, values, target, guide, present)
-        best = _smallest((last.coder,), values, target, guide, present)
-        rate = Winner.of("", len(best[0].data), best[0].errors).rate
+        if (
+            last is None
+            or last.coder not in names
+            or self.memory.chunks % self.settings.trial_every == 0
+        ):
+            return _smallest(_promising(names, values, target), values, target, context, present)
+        best = _smallest((last.coder,), values, target, context, present)
+        rate = Winner.of(best[0].coder, len(best[0].data), best[0].errors).rate
         if best[0].coder != last.coder or not last.rate / JUMP <= rate <= last.rate * JUMP:
             # Another phase of the flow may have begun, in which another coder pays.
-            rest = tuple(n for n in names if n != last.coder)
-            best = min(best, _smallest(rest, values, target, guide, present), key=_length)
+            rest = tuple(n for n in _promising(names, values, target) if n != last.coder)
+            best = min(best, _smallest(rest, values, target, context, present), key=_length)
         return best
 
 
@@ -267,28 +275,51 @@ def _length(result: tuple[CodedField, NDArray]) -> int:
     return len(result[0].data)
 
 
+def _promising(names: Sequence[str], values: NDArray, target: Target) -> tuple[str, ...]:
+    """Without those coders that take far more than the others on a sample of the bodies."""
+    bodies = values.shape[1]
+    if target.exact or bodies < 4 * SAMPLE:
+        return tuple(names)
+    middle = (bodies - SAMPLE) // 2
+    sample = np.ascontiguousarray(values[:, middle : middle + SAMPLE])
+    share = replace(target, frobenius=target.frobenius * math.sqrt(SAMPLE / bodies))
+    # What needs more than the values is as good as what does not.
+    sized = [name for name in names if name in ("tt", "predictive", "qtt")]
+    sizes = {name: len(coders.encode(name, sample, share) or sample.tobytes()) for name in sized}
+    fewest = min(sizes.values())
+    return tuple(n for n in names if sizes.get(n, 0) <= PROMISING * fewest)
+
+
 def _smallest(
     names: Sequence[str],
     values: NDArray,
     target: Target,
-    guide: NDArray | None,
+    context: coders.Context,
     present: NDArray | None,
 ) -> tuple[CodedField, NDArray]:
     """Of the coders named, the result in fewest bytes that keeps to the target; exact if none."""
     best = None
     for name in names:
-        data = coders.encode(name, values, target, guide)
+        data = coders.encode(name, values, target, context)
         if data is None or (best is not None and len(data) >= len(best[0].data)):
             continue
-        decoded = coders.decode(name, data, values.dtype, values.shape, guide)
+        decoded = coders.decode(name, data, values.dtype, values.shape, context.guide)
         errors = _measure(values, decoded, present)
         if target.met_by(errors) if not target.exact else _same_bits(values, decoded):
             best = CodedField(name, data, errors), decoded
     if best is not None:
         return best
-    data = coders.encode("exact", values, target, None)
+    data = coders.encode("exact", values, target)
     assert data is not None
     return CodedField("exact", data, _measure(values, values, present)), values
+
+
+def _spatial_order(block: Block, ends: NDArray | None) -> Callable[[], NDArray] | None:
+    """The order of bodies along the Morton curve at the first step, where positions are known."""
+    position = block.fields.get("position")
+    if position is None or position.shape[2] != 3 or not position.size:
+        return None
+    return lambda: morton_order(held(position, ends)[0])
 
 
 def _same_bits(values: NDArray, decoded: NDArray) -> bool:
