@@ -26,6 +26,7 @@ P_LEAST = 24  # no decision is ever surer than this [2^-16]
 MEMORY = 120  # decisions over which a probability is taken
 PRIOR = 4  # decisions for which the first guess of a probability counts
 RATES = 2 * P_ONE // (2 * np.arange(MEMORY + 1) + 3)  # weights of the next decision [2^-16]
+LONGER = 0.25  # the least first guess that a magnitude has one bit more
 TOP = 1 << 48  # the coder's interval is at most so wide, and at least TOP >> 8
 BYTE = 40  # bits below the coder's next byte
 
@@ -59,7 +60,8 @@ def contexts(columns):
             p[c * NEAR + near] = _within(ratio)
             seen[c * NEAR + near] = PRIOR
         for j in range(LENGTHS):
-            p[LENGTH + c * LENGTHS + j] = _within(ratio)
+            # Tails are heavier than that.
+            p[LENGTH + c * LENGTHS + j] = _within(max(ratio, LONGER))
             seen[LENGTH + c * LENGTHS + j] = PRIOR
             ratio *= ratio
         magnitude *= 1.4142135623730951

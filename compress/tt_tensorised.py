@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from compress import _kernels_train as kernels
 from compress._bytes import Bytes, number, signed
+from compress._kernels_basis import polynomials
 from compress.bounds import Target
 from compress.decompose import tt_svd
 from compress.entropy import decode_integers, encode_integers
@@ -56,8 +57,9 @@ class _Code:
             data += number(core.rounded.q.shape[1])
         bonds = [core.exponents for k, core in enumerate(self.cores) if k != self.pivot]
         data += encode_integers(np.concatenate([np.diff(bond, prepend=0) for bond in bonds]))
+        largest = max(self.cores, key=lambda core: core.rounded.q.size)
+        data += bytes(shift % 256 for shift in largest.rounded.shifts)
         for core in self.cores:
-            data += bytes(shift % 256 for shift in core.rounded.shifts)
             data += number(len(core.rounded.data)) + core.rounded.data
         return data
 
@@ -176,7 +178,8 @@ class _Train:
                 core = self.cores[k] if forward else self.cores[k].transpose(2, 1, 0)
                 exponents = np.rint(4.0 * np.log2(np.maximum(self.sigmas[k], 1e-30) / size))
                 scale = _power(exponents)
-                x = core[kept].reshape(-1, core.shape[2]) * scale
+                x = _transformed(core[kept], polynomials(core.shape[1]).T)
+                x = x.reshape(-1, core.shape[2]) * scale
                 stays = np.abs(x).max(axis=0) >= DROPPED
                 stays[0] |= not stays.any()
                 square += float(np.square(x[:, ~stays]).sum())
@@ -188,6 +191,7 @@ class _Train:
                 coded[k] = _Core(rounded, exponents[kept].astype(np.int64))
             ends[forward] = kept
         pivot = self.cores[self.pivot][ends[True]][:, :, ends[False]]
+        pivot = _transformed(pivot, polynomials(pivot.shape[1]).T)
         rounded = round_matrix(pivot.reshape(-1, pivot.shape[2]) / size, PRICE)
         if rounded is None:
             return None
@@ -195,6 +199,18 @@ class _Train:
         coded[self.pivot] = _Core(rounded, np.zeros(0, np.int64))
         cores = [coded[k] for k in range(len(self.cores))]
         return _Code(step, self.pivot, cores, size * math.sqrt(square))
+
+
+def _transformed(core: NDArray, matrix: NDArray) -> NDArray:
+    """core (r, n, s) with sums over i of core[:, i] matrix[i, j] at [:, j], in the order of i.
+
+    Cores change little from entry to entry where the field is smooth: as coefficients of
+    polynomials (of two entries: their sum and difference) most are near zero.
+    """
+    out = np.zeros_like(core)
+    for i, row in enumerate(matrix):
+        out += core[:, i, None, :] * row[:, None]
+    return out
 
 
 def _power(exponents: NDArray) -> NDArray:
@@ -215,6 +231,7 @@ def _read_cores(source: Bytes, shape: tuple[int, ...]) -> list[NDArray]:
     source.take(used)
     if len(differences) != sum(bonds):
         raise ValueError("coded block: too few weights")
+    shifts = shift_values(tuple(np.frombuffer(source.take(2), np.int8)))
     exponents = iter(np.split(differences, np.cumsum(bonds)[:-1]))
     cores = []
     for k, n in enumerate(shape):
@@ -224,7 +241,6 @@ def _read_cores(source: Bytes, shape: tuple[int, ...]) -> list[NDArray]:
             before = columns[k + 1] if k + 1 < len(shape) else 1
         if before * n * columns[k] > 1 << 31:
             raise ValueError("coded block: a core is too large")
-        shifts = shift_values(tuple(np.frombuffer(source.take(2), np.int8)))
         data = source.take(source.number(1 << 40))
         q = unround(data, before * n, columns[k])
         v = np.abs(q)
@@ -236,7 +252,7 @@ def _read_cores(source: Bytes, shape: tuple[int, ...]) -> list[NDArray]:
             if np.abs(power).max(initial=0) > 4000:
                 raise ValueError("coded block: a weight is out of range")
             matrix = matrix / _power(power)
-        core = matrix.reshape(before, n, columns[k])
+        core = _transformed(matrix.reshape(before, n, columns[k]), polynomials(n))
         cores.append(np.ascontiguousarray(core if k <= pivot else core.transpose(2, 1, 0)))
     if source.rest():
         raise ValueError("coded block: is longer than its cores")
