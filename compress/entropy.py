@@ -41,7 +41,7 @@ TAIL = 2.0**-14  # share of the table spread evenly, for outliers
 
 _QUARTERS = (1.0, 1.189207115002721, 1.4142135623730951, 1.681792830507429)
 # 2^-x on [0, 1): Taylor coefficients (-ln 2)^k / k!.
-_HALF_POWERS = tuple((-0.6931471805599453) ** k / math.factorial(k) for k in range(14))
+_HALF_POWERS = tuple((-0.6931471805599453) ** k / math.factorial(k) for k in range(18))
 
 
 class Writer:
@@ -69,7 +69,9 @@ class Writer:
     def symbols(self, values: NDArray, table: NDArray) -> None:
         """Range code `values` (n,) in [0, len(table)) with weights `table`."""
         if len(table) > 1 and len(values):
-            self.coder.encode(values.astype(np.int32, copy=False), models.Categorical(table, perfect=False))
+            self.coder.encode(
+                values.astype(np.int32, copy=False), models.Categorical(table, perfect=False)
+            )
 
     def bits(self, values: NDArray, width: int) -> None:
         """Range code `values` (n,) uint64 below 2^width, all equally likely."""
@@ -127,12 +129,8 @@ class Reader:
 
     def open(self) -> None:
         """Pass from the numbers to the range-coded symbols."""
-        words = self.number((len(self._data) - self.used) // 4)
-        end = self.used + 4 * words
-        self._coder = queue.RangeDecoder(
-            np.frombuffer(self._data[self.used : end], "<u4").astype(np.uint32)
-        )
-        self.used = end
+        words = self.take(4 * self.number(len(self._data) // 4))
+        self._coder = queue.RangeDecoder(np.frombuffer(words, "<u4").astype(np.uint32))
 
     def symbols(self, count: int, table: NDArray) -> NDArray:
         """The next `count` symbols, (count,) int32, coded with the weights `table`."""

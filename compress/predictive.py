@@ -592,7 +592,9 @@ def _decode_raw(data: bytes, kind: int, dtype, limit: int) -> NDArray:
             plain = stream.decompress(plain, size + 1)
         except zlib.error as error:
             raise ValueError(f"predictive block: {error}") from error
-    if len(plain) < size or (kind == DEFLATED and len(plain) > size):
+        if not stream.eof:
+            raise ValueError("predictive block: deflated values do not end")
+    if len(plain) != size:
         raise ValueError(f"predictive block: {len(plain)} bytes for shape {shape}")
     planes = np.frombuffer(plain[:size], np.uint8).reshape(np.dtype(dtype).itemsize, -1)
     return np.ascontiguousarray(planes.T).view(dtype).reshape(shape)
