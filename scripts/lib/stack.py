@@ -3,6 +3,7 @@
 paths                 directories in which this interpreter finds the MPI stack
 missing               modules of the stack and of the project's dependencies that are not found
 requirements [EXTRA]  what pip shall install: the dependencies without the stack
+alone [EXTRA]         those of them that are installed without their own dependencies
 constraints           the stack's versions as pip constraints
 """
 
@@ -15,6 +16,9 @@ from pathlib import Path
 # These belong to the machine's MPI stack: found, never installed from the package index. One
 # numpy newer than the one petsc4py was compiled with breaks petsc4py and scipy alike.
 STACK = ("mpi4py", "petsc4py", "numpy", "scipy", "h5py")
+# These ask for parts of the stack by a name that it may not have: pip would lay a serial h5py over
+# the MPI one of a distribution. They need nothing else.
+ALONE = ("hdf5plugin",)
 MODULES = {"pyyaml": "yaml"}  # where the module is not named as the package
 
 
@@ -36,6 +40,11 @@ def requirements(extras: list[str]) -> list[str]:
         sys.exit(f"unknown extra {unknown[0]!r}; there are {', '.join(known)}")
     lines = project["dependencies"] + [line for extra in extras for line in known[extra]]
     return [line for line in lines if package_name(line) not in STACK]
+
+
+def alone(extras: list[str]) -> list[str]:
+    """Return the requirements whose own dependencies are all of the stack."""
+    return [line for line in requirements(extras) if package_name(line) in ALONE]
 
 
 def paths() -> list[str]:
@@ -73,7 +82,9 @@ def main() -> None:
         case "missing":
             answer = missing(extras)
         case "requirements":
-            answer = requirements(extras)
+            answer = [line for line in requirements(extras) if package_name(line) not in ALONE]
+        case "alone":
+            answer = alone(extras)
         case "constraints":
             answer = constraints()
         case _:
