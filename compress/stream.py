@@ -40,11 +40,18 @@ class Part:
     """A tensor train Y in place of a tensor X.
 
     train : Y; error : ||X - Y||_F is at most this; norm : ||X||_F is at least this
+
+    Raises ValueError for an error or a norm that is negative or not finite.
     """
 
     train: TensorTrain
     error: float
     norm: float
+
+    def __post_init__(self) -> None:
+        for name, value in (("error", self.error), ("norm", self.norm)):
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} = {value}: must be finite and >= 0")
 
 
 class TensorTrainStream:
@@ -252,7 +259,12 @@ class TensorTrainStream:
         for saved in description["parts"]:
             train, at = _read_train(saved, cores, at)
             part = Part(train, float(saved["error"]), float(saved["norm"]))
-            stream._parts.append((int(saved["level"]), part))
+            level = int(saved["level"])
+            if not 0 <= level < (stream._parts[-1][0] if stream._parts else 64):
+                raise ValueError(f"part of level {level} where there can be none")
+            if part.error > stream.tolerance * part.norm:
+                raise ValueError(f"part of level {level}: its error is above the tolerance")
+            stream._parts.append((level, part))
         if at != len(cores):
             raise ValueError("more cores than described")
         stream.chunks = int(description["chunks"])
@@ -301,12 +313,8 @@ def _share(level: int) -> float:
 
 def _stated(train: TensorTrain, error: float, norm: float | None) -> Part:
     """A part of a train that stands for a chunk."""
-    if not (math.isfinite(error) and error >= 0.0):
-        raise ValueError(f"error = {error}: must be finite and >= 0")
     if norm is None:
         norm = max(train.norm() - error, 0.0)
-    if not (math.isfinite(norm) and norm >= 0.0):
-        raise ValueError(f"norm = {norm}: must be finite and >= 0")
     return Part(train, float(error), _SHORT * norm)
 
 
