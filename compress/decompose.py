@@ -140,7 +140,7 @@ def tt_svd(
     tolerance : relative; `absolute` instead is ||X - Y||_F [unit of the values]. With neither, and
                 no max_ranks, ranks are exact: to EXACT rounding units of the values.
     max_ranks : a cap for all d - 1 inner ranks or one for each; the error that comes of it is
-                reported.
+                reported, and not taken from what other bonds may lose.
     method    : "gram" squares the condition and is taken only where its floor of about 1e-7 lies
                 well below the tolerance (else "qr" steps in); "qr" is good to rounding;
                 "randomised" pays for long dimensions of small rank, and serves those alone;
@@ -178,9 +178,10 @@ def tt_svd(
     cores = sweep.finish()
     truncation = math.sqrt(sweep.lost)
     error = truncation + sweep.rounding() * seen.norm
+    least = float(np.finfo(X.dtype).smallest_subnormal)  # what rounding the pivot may be down to
     return Decomposition(
         TensorTrain(tuple(cores)),
-        error=error / seen.scale,
+        error=error / seen.scale + (least / 2.0 * math.sqrt(cores[sweep.first].size)),
         truncation=truncation / seen.scale,
         norm=seen.norm / seen.scale,
         allowed=allowed / seen.scale,
@@ -255,7 +256,7 @@ class _Sweep:
         self.rank = {"left": 1, "right": 1}
         self.left: list[NDArray] = []
         self.right: list[NDArray] = []
-        self.factor_of_two = scale  # still to be taken off the pivot
+        self.applied = scale  # to be taken off again, if it ever was
         self.lost = 0.0
         self.projections = 0.0  # sum of k^(2/3)
         self.rounded = 0  # cores with digits to round
@@ -275,12 +276,13 @@ class _Sweep:
         name, factor = self._factor(M, peel.count, caps[-1])
         flops = FLOPS[name](M, factor.L.shape[1])
         self.budget.lose(factor.missed)
-        self.lost += factor.missed
         cores, U, lost = _split_side(
             factor.L, self.rank[peel.side], modes, caps, self.budget, peel.side
         )
-        self.lost += lost
-        if U is not None:
+        if U is None:  # nothing is lost, and nothing was missed
+            self.budget.lose(-factor.missed)
+        else:
+            self.lost += factor.missed + lost
             self.values, self.scale = M.project(U).reshape(-1), 1.0
             self.projections += peel.count * min(peel.rows, peel.columns) ** (2.0 / 3.0)
             self.rounded += len(cores)
@@ -340,7 +342,7 @@ class _Sweep:
         n = self.shape[self.first]
         pivot = self.values.reshape(self.rank["left"], n, self.rank["right"])
         # A scale that never was applied has not to be taken off.
-        undo = 1.0 if self.scale != 1.0 else 1.0 / self.factor_of_two
+        undo = 1.0 if self.scale != 1.0 else 1.0 / self.applied
         cores = [*self.left, pivot, *self.right[::-1]]
         return _scaled_back(cores, self.first, undo, self.dtype)
 

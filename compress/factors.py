@@ -99,8 +99,9 @@ def split(
     remainder, r, total = L, rank, 0.0
     for n, most in zip(modes, caps, strict=True):
         A = remainder.reshape(r * n, -1)
-        U, lost = basis(A, budget.share(), most)
-        budget.spend(lost)
+        share = budget.share()
+        U, lost = basis(A, share, most)
+        budget.spend(min(lost, share))  # more is the doing of a cap
         total += lost
         core = np.eye(r * n) if U is None else U
         remainder = A if U is None else U.T @ A

@@ -491,6 +491,18 @@ def test_cap_that_prevents_the_tolerance_is_told():
     assert capped.error == pytest.approx(error_of(capped, X), rel=1e-6)
 
 
+def test_cap_of_one_bond_leaves_the_exact_ranks_of_the_others():
+    generator = np.random.default_rng(26)
+    X, _ = low_rank(generator, (6, 7, 20, 8, 9), 4)
+    for method in METHODS:
+        for direction in DIRECTIONS:
+            for tolerance in (None, 1e-6):
+                caps = [99, 2, 99, 99]
+                found = tt_svd(X, tolerance, caps, method=method, direction=direction)
+                assert found.train.ranks[2] == 2 and max(found.train.ranks) <= 4
+                assert found.error == pytest.approx(error_of(found, X), rel=1e-6)
+
+
 def test_error_that_bonds_leave_over_is_used_by_the_others():
     # The first bonds have exact ranks, so all of the error is left to the last ones.
     generator = np.random.default_rng(20)
