@@ -14,7 +14,7 @@ from compress import _kernels_context as kernels
 
 # Squared error, in squared steps, that a bit has to save. Where the step is small against the
 # values, halving it costs one bit a value: d(step^2 / 12) / d(bits) = step^2 ln(2) / 6 = 0.116.
-PRICE = 0.1
+PRICE = 0.12
 
 LARGEST = float(1 << 46)  # magnitudes that can be coded
 SHIFT_PARTS = 512  # a shift is a number of these parts of a step

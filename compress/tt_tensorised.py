@@ -31,7 +31,7 @@ TRUNCATION = 0.6  # share of the error that truncation may take, the rest is rou
 PASSES = 6
 DROPPED = 0.6  # a column below so many steps would be rounded to nothing
 QUARTERS = (1.0, 1.189207115002721, 1.4142135623730951, 1.681792830507429)
-MOST_PARAMETERS = 1.0  # a share of the entries: more cannot pay
+MOST_PARAMETERS = 2.0  # to the entries: a number of a core costs some bits, not 64
 
 
 @dataclass(frozen=True)

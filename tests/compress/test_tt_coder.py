@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -128,7 +129,7 @@ def test_error_falls_with_the_bytes_at_six_decibels_a_bit():
         len(encode(values, Bound("relative", tolerance).target(values)))
         for tolerance in (2.0**-6, 2.0**-7, 2.0**-8)
     ]
-    for coarse, fine in zip(sizes, sizes[1:], strict=False):
+    for coarse, fine in pairwise(sizes):
         assert 0.95 <= 8 * (fine - coarse) / values.size <= 1.05
 
 
