@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from itertools import pairwise
 
@@ -321,3 +322,26 @@ def test_steps_are_the_largest_numbered_ones_below():
     for step in (1.0, 0.7, 3e-9, 2.0**-60, 5.0):
         code = step_code(step)
         assert step_size(code) <= step < step_size(code + 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "digest"),
+    [
+        (
+            "010609020852dc0420137b397190ac0f194249b68db3194a85d95653ada59809f8d12e759c55f413938021133f"
+            "f6449da7027552dcbc9f1c983da54ef2d848f3",
+            "ddea6c658ddbaece",
+        ),
+        (
+            "020609020882da040305030201010d0124190384c3a9f6b0764cf95eee1a491abd0d133f3ac186180e8d0ebe14"
+            "8320201354fbfe28f84c878137d91d0558aefa769d70ee6aae84a0cdb5acf1d9d733a01b00011f9bd14b864ea7"
+            "d617ad4fac7a22c28c59cd8ca0ebf2be9f600c00010bbee7614351c5cd826807133b0504204b80",
+            "2063bd223136026a",
+        ),
+    ],
+    ids=FORMS,
+)
+def test_code_of_another_machine_gives_the_same_bits(text, digest):
+    """Fields are predicted from decoded ones: what is decoded must not depend on the machine."""
+    decoded = decode(bytes.fromhex(text)).astype("<f8")
+    assert hashlib.sha256(decoded.tobytes()).hexdigest()[:16] == digest
