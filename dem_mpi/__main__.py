@@ -115,6 +115,10 @@ def run_command(
         contact.law,
         contact.scip.form,
     )
+    if loaded.scenario.compress is not None:
+        from dem_mpi.compression import compile_kernels
+
+        compile_kernels(parallel)
     seconds = perf_counter() - started
     if compiled and seconds > 2.0:
         _print(f"compiled kernels in {seconds:.0f} s (first run only; kept in the numba cache)")
@@ -661,6 +665,7 @@ def warmup(
     """Compile all kernels into the numba cache, so that no run has to."""
     from time import perf_counter
 
+    from dem_mpi.compression import compile_kernels as compile_coders
     from dem_mpi.flow import compile_kernels
     from dem_mpi.flow_options import FlowOptions
     from dem_mpi.parallel import Parallel
@@ -672,6 +677,7 @@ def warmup(
     warm_up(parallel, threads, ("matrix_free", "assembled"), kinds, ("apgd", "scip"))
     warm_up(parallel, threads, kinds=kinds, law="coulomb")
     compile_kernels(parallel, FlowOptions(threads=threads))
+    compile_coders(parallel)
     _print(f"kernels ready in {perf_counter() - started:.1f} s")
 
 

@@ -21,7 +21,14 @@ from compress.bounds import Bound
 from dem_mpi import __version__
 from dem_mpi.array_source import ArraySource, is_array
 from dem_mpi.compress_options import CompressOptions, choose
-from dem_mpi.compression import ArchiveFacts, ChunkWriter, block_of, fields_text, guide_of
+from dem_mpi.compression import (
+    ArchiveFacts,
+    ChunkWriter,
+    block_of,
+    compile_kernels,
+    fields_text,
+    guide_of,
+)
 from dem_mpi.errors import DemError, InputError, StoppedError
 from dem_mpi.h5files import readable_size
 from dem_mpi.metrics import duration, on_terminal
@@ -52,6 +59,8 @@ def compress_file(
             return
         _refuse_output(parallel, options, source)
         blocks = _together(parallel, lambda: _blocks_of_rank(parallel, source, options.chunk))
+        if parallel.size > 1:
+            compile_kernels(parallel)
         writer, done = _open_writer(parallel, options, source, len(blocks))
         say(f"{fields_text(specs)}; {options.chunk} frames a chunk")
         try:

@@ -116,6 +116,7 @@ class ArchiveFacts:
     def coder_line(self) -> str:
         """Bytes by coder, the largest first."""
         order = sorted(self.coders.items(), key=lambda item: -item[1])
+        order.append(("all else", self.coded - sum(self.coders.values())))
         return "bytes by coder: " + ", ".join(f"{name} {size:,}" for name, size in order)
 
 
@@ -395,3 +396,35 @@ def _put_aside(parallel: Parallel, path: Path, error: DemError) -> str:
                     f"{error}; it is kept as {kept.name} and the archive begins here in a new file"
                 )
     return parallel.broadcast(message)
+
+
+# ---- compilation ---------------------------------------------------------------------------
+
+
+def compile_kernels(parallel: Parallel) -> None:
+    """Collective. Compile the kernels of all coders on rank 0, then load them on the others.
+
+    Ranks that compiled at the same time would race for numba's cache on disk.
+    """
+    for turn in (True, False):
+        error = None
+        if (parallel.rank == 0) == turn:
+            try:
+                _code_a_few_bodies()
+            except Exception as caught:
+                error = caught
+        parallel.raise_together(error)
+
+
+def _code_a_few_bodies() -> None:
+    """Try all coders on bodies that fly and shake, to a mean and to a largest error."""
+    frames, n = 8, 64
+    times = 1e-3 * np.arange(frames)
+    velocity = np.random.default_rng(0).standard_normal((frames, n, 3))
+    position = np.cumsum(1e-3 * velocity, axis=0)
+    block = Block(np.arange(n), {"velocity": velocity, "position": position})
+    for kind in ("relative", "pointwise"):
+        bounds = {"velocity": (kind, 1e-2), "position": (kind, 1e-4)}
+        encoder = Encoder(field_specs(bounds))
+        for _ in range(2):  # a first chunk, and one with another before it
+            encoder.encode(block, times)
