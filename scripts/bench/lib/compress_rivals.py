@@ -71,7 +71,8 @@ def measured(rival: str, arrays: list[NDArray], bound: float, scratch: Path) -> 
 
     bound : as the root mean square error that it aims at [unit of the values].
     """
-    with h5py.File(scratch, "w", driver="core", backing_store=False) as file:
+    # Without a cache of pieces, from which small ones would come back as they were.
+    with h5py.File(scratch, "w", driver="core", backing_store=False, rdcc_nbytes=0) as file:
         began = process_time()
         stored = [_store(file, f"a{k}", rival, array, bound) for k, array in enumerate(arrays)]
         file.flush()
