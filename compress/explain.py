@@ -31,6 +31,9 @@ from dem_mpi.errors import InputError
 # in the same order throughout.
 Reader = Callable[[str, int, int], NDArray]
 
+# Of a field in a chunk, for each coder, least and most bytes to expect of all bodies.
+Sizes = Mapping[str, tuple[float, float]]
+
 _LAGS = (1, 4, 16, 64)
 _TOLERANCES = (1e-1, 1e-2, 1e-3)
 
@@ -151,6 +154,7 @@ def explain(
     starts = _window_starts(len(times), chunk, sampling)
     length = min(max(sampling.steps, chunk), len(times))
     series: dict[str, list[NDArray]] = {name: [] for name in fields}
+    places: list[NDArray] = []
     bodies = 0
     for first in starts:
         place = None
@@ -160,11 +164,17 @@ def explain(
                 bodies = values.shape[1]
                 where = read(positions, first, first + 1)[0] if positions is not None else None
                 place = _sample_of_bodies(bodies, where, sampling)
+                places.append(place)
             values = np.ascontiguousarray(values[:, place])
             _require_finite(name, fields[name], values, first, place)
             series[name].append(values)
     chunk = min(chunk, len(times))
-    sizes = _coded_sizes(series, fields, [times[f : f + chunk] for f in starts], chunk, bodies)
+    sizes: dict[str, list[Sizes]] = {name: [] for name in fields}
+    for window, first in enumerate(starts):
+        blocks = {name: series[name][window][:chunk] for name in fields}
+        coded = _coded_sizes(blocks, fields, times[first : first + chunk], places[window], bodies)
+        for name in fields:
+            sizes[name].append(coded[name])
     known = tuple(
         _explain_field(name, fields[name], series[name], sizes[name], chunk, bodies)
         for name in fields
@@ -272,33 +282,30 @@ def _require_finite(
 
 
 def _coded_sizes(
-    series: Mapping[str, Sequence[NDArray]],
+    blocks: Mapping[str, NDArray],
     fields: Mapping[str, FieldSpec],
-    times: Sequence[NDArray],
-    chunk: int,
+    times: NDArray,
+    place: NDArray,
     bodies: int,
-) -> dict[str, list[dict[str, tuple[float, float]]]]:
-    """Per field and chunk, for each coder, least and most bytes to expect of all bodies.
+) -> dict[str, Sizes]:
+    """Of each field of a chunk (T, n, w), whose bodies are those at `place` (n,) of all.
 
     Half of the sample is coded besides: a line through both tells what a chunk costs however many
     bodies it has. Most is the bytes of the sample times the number of bodies in it.
     """
-    found: dict[str, list[dict[str, tuple[float, float]]]] = {name: [] for name in fields}
-    for window, clock in enumerate(times):
-        blocks = {name: series[name][window][:chunk] for name in fields}
-        seen = next(iter(blocks.values())).shape[1]
-        whole = _block_sizes(blocks, fields, clock)
-        half = {}
-        if bodies > seen > 1:
-            half = _block_sizes({n: v[:, : seen // 2] for n, v in blocks.items()}, fields, clock)
-        for name, sizes in whole.items():
-            found[name].append(
-                {
-                    coder: _extrapolated(size, half.get(name, {}).get(coder), seen, bodies)
-                    for coder, size in sizes.items()
-                }
-            )
-    return found
+    seen = len(place)
+    whole = _block_sizes(blocks, fields, times, place)
+    half: dict[str, dict[str, int]] = {}
+    if bodies > seen > 1:
+        few = {name: values[:, : seen // 2] for name, values in blocks.items()}
+        half = _block_sizes(few, fields, times, place[: seen // 2])
+    return {
+        name: {
+            coder: _extrapolated(size, half.get(name, {}).get(coder), seen, bodies)
+            for coder, size in sizes.items()
+        }
+        for name, sizes in whole.items()
+    }
 
 
 def _extrapolated(size: int, half: int | None, seen: int, bodies: int) -> tuple[float, float]:
@@ -311,39 +318,47 @@ def _extrapolated(size: int, half: int | None, seen: int, bodies: int) -> tuple[
 
 
 def _block_sizes(
-    blocks: Mapping[str, NDArray], fields: Mapping[str, FieldSpec], times: NDArray
+    blocks: Mapping[str, NDArray], fields: Mapping[str, FieldSpec], times: NDArray, place: NDArray
 ) -> dict[str, dict[str, int]]:
-    """Bytes of each field by each coder that keeps to its bound."""
+    """Bytes of each field by each coder that keeps to its bound.
+
+    Archives keep bodies by number: so they are coded, the order in space being told besides.
+    """
+    by_number = np.argsort(place)
+    in_space = np.argsort(by_number)
+    known = (np.diff(place) < 0).any()
+    order = (lambda: in_space) if known else None
     sizes: dict[str, dict[str, int]] = {}
     decoded: dict[str, NDArray] = {}
     for name in in_order_of_guides(fields):
         spec = fields[name]
-        values = np.ascontiguousarray(blocks[name])
+        values = np.ascontiguousarray(blocks[name][:, by_number])
         exact = spec.bound.kind == "exact" or values.dtype.kind != "f"
         target = Target(0.0, 0.0) if exact else spec.bound.target(values)
         guide = None if spec.guide is None else increments(decoded[spec.guide], times)
-        sizes[name], decoded[name] = _try_coders(values, target, guide)
+        context = coders.Context(guide, order)
+        sizes[name], decoded[name] = _try_coders(values, target, context)
     return sizes
 
 
 def _try_coders(
-    values: NDArray, target: Target, guide: NDArray | None
+    values: NDArray, target: Target, context: coders.Context
 ) -> tuple[dict[str, int], NDArray]:
     """Bytes by each coder that meets the target, and what the best of them decodes to."""
     sizes: dict[str, int] = {}
     best = values
-    for coder in coders.candidates(target, guide is not None):
-        data = coders.encode(coder, values, target, guide)
+    for coder in coders.candidates(target, context):
+        data = coders.encode(coder, values, target, context)
         if data is None:
             continue
-        decoded = coders.decode(coder, data, values.dtype, values.shape, guide)
+        decoded = coders.decode(coder, data, values.dtype, values.shape, context.guide)
         same = decoded.tobytes() == values.tobytes()
         if same or (not target.exact and target.met_by(measure(values, decoded))):
             if len(data) < min(sizes.values(), default=len(data) + 1):
                 best = decoded
             sizes[coder] = len(data)
     if not sizes:
-        sizes["exact"] = len(coders.encode("exact", values, target, None) or b"")
+        sizes["exact"] = len(coders.encode("exact", values, target) or b"")
     return sizes, best
 
 
@@ -354,7 +369,7 @@ def _explain_field(
     name: str,
     spec: FieldSpec,
     windows: Sequence[NDArray],
-    sizes: Sequence[Mapping[str, tuple[float, float]]],
+    sizes: Sequence[Sizes],
     chunk: int,
     bodies: int,
 ) -> FieldExplanation:
@@ -372,7 +387,7 @@ def _highest_rank(values: NDArray) -> int:
     return max(unfolding_ranks(Tensorisation.of(values.shape, "natural").forward(values), 1e-2))
 
 
-def _expected(raw: int, sizes: Sequence[Mapping[str, tuple[float, float]]]) -> tuple[Expected, ...]:
+def _expected(raw: int, sizes: Sequence[Sizes]) -> tuple[Expected, ...]:
     """Of the pick of coders in each chunk, and of each one that can code all chunks."""
     picks = [min(chunk.values()) for chunk in sizes]
     found = [_ratios("any", raw, picks)]
@@ -405,7 +420,7 @@ def _correlation_lines(known: Correlation) -> list[str]:
 def _rank_lines(known: Sequence[Ranks]) -> list[str]:
     forms = dict.fromkeys(one.form for one in known)
     return [
-        f"  {form} tensor: largest rank (entries a parameter) "
+        f"  largest rank (entries a parameter), {form}: "
         + ", ".join(
             f"{one.largest} ({one.ratio:.3g}) at {one.tolerance:.0e}"
             for one in known

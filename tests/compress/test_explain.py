@@ -108,6 +108,19 @@ def test_the_longer_the_correlation_the_higher_the_ratio():
     assert ratio[-1] > 10.0 * ratio[0]
 
 
+def test_the_expected_ratio_follows_the_correlation():
+    specs = {"a": FieldSpec(Bound("relative", 1e-2), width=1)}
+    sampling = Sampling(windows=1, steps=64)
+    found = []
+    for factor in (0.0, 0.9, 0.99, 0.999):
+        field = autoregressive(factor, (64, 300, 1))
+        known = explain(reader({"a": field}), specs, np.arange(64.0), 64, None, sampling)
+        found.append((known.fields[0].correlation.iac[1], known.fields[0].expected[0].whole))
+    iac, ratio = np.array(found).T
+    assert (np.diff(iac) > 0.0).all()
+    assert (np.diff(ratio) > 0.0).all()
+
+
 def strain_and_moduli() -> tuple[np.ndarray, np.ndarray]:
     """Time series (T, n, w) like those of S. De's triaxial test: of size 1e-1 and of size 1e7."""
     t = np.linspace(0.0, 1.0, 64)[:, None, None]
