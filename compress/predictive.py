@@ -305,7 +305,7 @@ def _find_drift(x: NDArray) -> NDArray:
     drift = np.empty(width)
     for c in range(width):
         increments = np.sort(moved[:, c].ravel())
-        run = max(4, len(increments) // 20)
+        run = min(max(4, len(increments) // 20), len(increments))
         first = int(np.argmin(increments[run - 1 :] - increments[: len(increments) - run + 1]))
         drift[c] = increments[first + run // 2]
     return drift
