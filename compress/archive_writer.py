@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from compress.archive_format import (
     ROW,
+    DamageError,
     Header,
     OpenFile,
     Piece,
@@ -36,7 +37,7 @@ from compress.coding import (
     add_scales,
     check_fields,
 )
-from dem_mpi.errors import InputError, OutputError
+from dem_mpi.errors import DataError, InputError, OutputError
 from dem_mpi.h5files import HDF5_ERRORS, OutputLock, fsync, reason, require_space
 from dem_mpi.parallel import Parallel
 
@@ -52,6 +53,8 @@ class ArchiveWriter:
     where an exception ends it.
     """
 
+    _descriptor: int | None = None
+
     def __init__(
         self,
         path: Path | str,
@@ -66,15 +69,19 @@ class ArchiveWriter:
         Raises OutputError if there is such a file (unless `force`), or it cannot be written.
         """
         check_fields(fields)
-        path = Path(path)
-        if path.exists() and not force:
-            raise OutputError(f"{path}: exists already")
         header = Header(dict(fields), settings, dict(provenance or {}))
         try:
             header.text()
         except (TypeError, ValueError) as error:
             raise InputError(f"provenance: {error}") from None
-        self._begin(path, header, None, ())
+        self._lock = OutputLock(Parallel.alone(), path)
+        try:
+            if Path(path).exists() and not force:
+                raise OutputError(f"{path}: exists already")
+            self._begin(Path(path), header, None, ())
+        except BaseException:
+            self.abandon()
+            raise
 
     @classmethod
     def resume(cls, path: Path | str, last_step: int | None = None) -> ArchiveWriter:
@@ -84,12 +91,20 @@ class ArchiveWriter:
         such file, DataError if it is damaged, OutputError if it cannot be written.
         """
         self = cls.__new__(cls)
-        opened = open_archive(path)
-        with opened.file:
-            kept = list(
-                takewhile(lambda r: last_step is None or r.steps.max() <= last_step, opened.records)
-            )
-            self._begin(Path(path), opened.header, opened, kept)
+        self._lock = OutputLock(Parallel.alone(), path)
+        try:
+            opened = open_archive(path)
+            with opened.file:
+                kept = takewhile(
+                    lambda r: last_step is None or r.steps.max() <= last_step, opened.records
+                )
+                self._begin(Path(path), opened.header, opened, list(kept))
+        except (DamageError, ValueError) as error:
+            self.abandon()
+            raise DataError(f"{path}: damaged: {error}") from None
+        except BaseException:
+            self.abandon()
+            raise
         return self
 
     def _begin(
@@ -103,22 +118,16 @@ class ArchiveWriter:
         self._last_step: int | None = None
         self._total: dict[str, Scale] = {name: Scale() for name in header.fields}
         self._winners: dict[int, dict[str, Winner]] = {}
-        self._descriptor: int | None = None
         self._places = Places(0, 0)
         self._room = Places(0, 0)
-        self._lock = OutputLock(Parallel.alone(), path)
-        try:
-            for number, record in enumerate(kept):
-                assert source is not None
-                self._replay(number, record, source)
-            with self._writing():
-                if source is not None:
-                    self._descriptor = os.open(path, os.O_RDONLY)
-                    self._places = source.places
-                self._rebuild(complete=False)
-        except BaseException:
-            self.abandon()
-            raise
+        for number, record in enumerate(kept):
+            assert source is not None
+            self._replay(number, record, source)
+        with self._writing():
+            if source is not None:
+                self._descriptor = os.open(path, os.O_RDONLY)
+                self._places = source.places
+            self._rebuild(complete=False)
 
     def _replay(self, number: int, record: Record, source: OpenFile) -> None:
         """Remember a chunk that is in the file already."""

@@ -61,7 +61,9 @@ def encode(name: str, values: NDArray, target: Target, context: Context = NOTHIN
     if name == "constant":
         return _encode_constant(values, target)
     if name in ("predictive", GUIDED):
-        return predictive.encode(values, target, guide=context.guide if name == GUIDED else None)
+        guide = context.guide if name == GUIDED else None
+        data = predictive.encode(values, target, guide=guide)
+        return data if data[0] % predictive.SINGLE == predictive.PATHS else None
     if name == "tt":
         data = tt_coder.encode(values, target)
         return data if tt_coder.pays(data) else None

@@ -401,7 +401,7 @@ def check_fields(fields: Mapping[str, FieldSpec]) -> None:
         raise InputError("fields: an archive needs at least one")
     for name, spec in fields.items():
         dtype = np.dtype(spec.dtype)
-        if dtype.kind not in "biuf" or dtype.itemsize > 8:
+        if dtype.kind not in "biuf" or dtype.itemsize > 8 or not dtype.isnative:
             raise InputError(f"{name}: {dtype} is no plain number of at most 8 bytes")
         if dtype.kind == "f" and dtype.itemsize < 4 and spec.bound.kind != "exact":
             raise InputError(f"{name}: {dtype} can only be kept exactly")

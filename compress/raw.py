@@ -12,6 +12,7 @@ import lzma
 import math
 import zlib
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -101,12 +102,17 @@ def _compress(data: bytes, method: int) -> bytes:
 
 def _decompress(data: bytes, method: int, size: int) -> bytes:
     """At most `size` + 1 bytes, whatever the data claim."""
+    if method == _STORED:
+        return data
+    decoder: Any = (
+        zlib.decompressobj()
+        if method == _ZLIB
+        else lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_LZMA_FILTERS)
+    )
     try:
-        if method == _ZLIB:
-            return zlib.decompressobj().decompress(data, size + 1)
-        if method == _LZMA:
-            decoder = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_LZMA_FILTERS)
-            return decoder.decompress(data, size + 1)
+        decompressed = decoder.decompress(data, size + 1)
     except (zlib.error, lzma.LZMAError, EOFError) as error:
         raise ValueError(f"cannot be decompressed: {error}") from None
-    return data
+    if not decoder.eof:
+        raise ValueError("cannot be decompressed: is cut off, or longer than expected")
+    return decompressed
