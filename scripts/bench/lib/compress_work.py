@@ -302,6 +302,9 @@ def _insitu(run: Sediment, task: dict[str, Any]) -> dict[str, Any]:
     seconds: dict[str, list[float]] = {"without": [], "with": []}
     shares, size = [], 0
     with tempfile.TemporaryDirectory() as directory:
+        # A run of two chunks compiles what is not compiled yet.
+        first = _scene(run, Path(directory) / "first.yaml", True, 2 * STEPS * STEP)
+        simulate(first, Path(directory) / "first", run.settings)
         for kind in [*seconds] * task["runs"]:
             place = Path(directory) / kind
             scene = _scene(run, Path(directory) / f"{kind}.yaml", kind == "with", task["end"])
