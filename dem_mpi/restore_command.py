@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,7 +22,6 @@ from dem_mpi.output import Field, Trajectory
 from dem_mpi.parallel import Parallel
 from dem_mpi.trajectory_chunks import TrajectoryChunks
 
-_FORMATS = (".h5", ".npz", ".npy")
 _MOST_ROWS = 10_000  # that are printed
 
 
@@ -71,35 +71,42 @@ def restore_file(
     """Decode what is selected into a trajectory (.h5), or arrays (.npz, .npy)."""
     with Archive(path) as archive:
         names, frames = _names(archive, selection), frames_of(archive, selection.steps)
-        ordinary = "position" in names and not archive.fields["position"].shape
-        if out is None:
-            out = path.with_name(
-                f"{path.name.split('.')[0]}.restored{'.h5' if ordinary else '.npz'}"
-            )
-        if out.suffix not in _FORMATS:
-            raise InputError(f"--output {out}: must end in {', '.join(_FORMATS)}")
-        refuse_place("--output", out, force)
-        if out.exists() and out.samefile(path):
-            raise InputError(f"--output {out}: is the archive itself")
-        if out.suffix == ".h5":
-            if not ordinary:
-                raise InputError(
-                    f"--output {out}: a trajectory needs position, which "
-                    f"{'is not in --fields' if 'position' in archive.fields else 'is not archived'}"
-                    "; write .npz or .npy"
-                )
-            rows = _write_trajectory(archive, names, frames, selection, out)
-        elif out.suffix == ".npy":
-            if len(names) != 1:
-                raise InputError(
-                    f"--output {out}: holds one field, choose it with --fields: {', '.join(names)}"
-                )
-            rows = _write_array(archive, names[0], frames, selection, out)
-        else:
-            rows = _write_arrays(archive, names, frames, selection, out)
+        out = _place(archive, names, out, force)
+        # It takes its name when it is whole: damage may show half-way.
+        part = out.with_name(f"{out.name}.part")
+        try:
+            rows = _WRITERS[out.suffix](archive, names, frames, selection, part)
+            with agree(Parallel.alone(), out, "write"):
+                part.replace(out)
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
     size = readable_size(out.stat().st_size)
     count = frames.stop - frames.start
     say(f"wrote {out}: {count:,} frames, {rows:,} bodies, {', '.join(names)}; {size}")
+
+
+def _place(archive: Archive, names: tuple[str, ...], out: Path | None, force: bool) -> Path:
+    """Where to write. InputError for a file that cannot hold the fields, or may not be written."""
+    path = archive.path
+    placed = "position" in names and not archive.fields["position"].shape
+    if out is None:
+        out = path.with_name(f"{path.name.split('.')[0]}.restored{'.h5' if placed else '.npz'}")
+    if out.suffix not in _WRITERS:
+        raise InputError(f"--output {out}: must end in {', '.join(_WRITERS)}")
+    refuse_place("--output", out, force)
+    if out.exists() and out.samefile(path):
+        raise InputError(f"--output {out}: is the archive itself")
+    if out.suffix == ".h5" and not placed:
+        why = "is not in --fields" if "position" in archive.fields else "is not archived"
+        raise InputError(
+            f"--output {out}: a trajectory needs position, which {why}; write .npz or .npy"
+        )
+    if out.suffix == ".npy" and len(names) != 1:
+        raise InputError(
+            f"--output {out}: holds one field, choose it with --fields: {', '.join(names)}"
+        )
+    return out
 
 
 def _write_trajectory(
@@ -140,9 +147,10 @@ def _write_trajectory(
 
 
 def _write_array(
-    archive: Archive, name: str, frames: slice, selection: Selection, out: Path
+    archive: Archive, names: tuple[str, ...], frames: slice, selection: Selection, out: Path
 ) -> int:
     """An array (T, m, w), or of the shape it had, chunk by chunk; NaN where a body is not there."""
+    (name,) = names
     spec = archive.fields[name]
     whole = bool(spec.shape) and selection.bodies == ALL
     with agree(Parallel.alone(), out, "write"):
@@ -190,9 +198,13 @@ def _write_arrays(
             arrays[name] = values.reshape(len(values), *spec.shape)
         else:
             arrays[name] = values[:, :, 0] if spec.width == 1 else values
-    with agree(Parallel.alone(), out, "write"):
-        np.savez(out, **arrays)
+    # Given its name numpy would write to one with another ending.
+    with agree(Parallel.alone(), out, "write"), out.open("wb") as file:
+        np.savez(file, **arrays)
     return len(found.gid)
+
+
+_WRITERS = {".h5": _write_trajectory, ".npz": _write_arrays, ".npy": _write_array}
 
 
 # ---- slice ---------------------------------------------------------------------------------

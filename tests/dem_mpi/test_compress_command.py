@@ -177,8 +177,9 @@ def test_what_is_wrong_is_told_in_one_line(folder, arguments, code, words):
     assert line.startswith("dem-mpi: error: ") and words in line
 
 
-@pytest.mark.parametrize("place", [0.1, 0.5, 0.9, "short"])
+@pytest.mark.parametrize("place", [0.1, 0.3, 0.5, 0.7, 0.9, "short"])
 def test_a_damaged_archive_is_refused_in_one_line(folder, tmp_path, place):
+    """Damage to bytes that HDF5 has left unused changes nothing, and may pass."""
     data = bytearray((folder / "a.tt.h5").read_bytes())
     if place == "short":
         data = data[: len(data) // 2]
@@ -187,10 +188,15 @@ def test_a_damaged_archive_is_refused_in_one_line(folder, tmp_path, place):
         data[middle : middle + 64] = bytes(byte ^ 0x5A for byte in data[middle : middle + 64])
     (tmp_path / "bad.tt.h5").write_bytes(data)
     info = verb(tmp_path, "info", "bad.tt.h5")
+    done = verb(tmp_path, "restore", "bad.tt.h5", "--output", "x.h5")
+    assert info.returncode == done.returncode
+    if info.returncode == 0:
+        assert place == 0.1
+        compared = verb(tmp_path, "compare", str(folder / "a.tt.h5"), "x.h5").stdout
+        assert compared.count(" equal") == len(compared.splitlines()) - 1
+        return
     assert info.returncode == 65
     assert len(info.stdout.splitlines()) == 1 and "not valid: " in info.stdout
-    done = verb(tmp_path, "restore", "bad.tt.h5", "--output", "x.h5")
-    assert done.returncode == 65
     (line,) = messages(done.stderr)
     assert "bad.tt.h5" in line
     assert not list(tmp_path.glob("x.h5*"))
