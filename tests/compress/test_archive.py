@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import signal
 import subprocess
 import sys
+import tracemalloc
 from dataclasses import replace
 
 import h5py
@@ -355,6 +357,23 @@ def test_files_grow_beyond_their_first_size(tmp_path):
             archive.read().fields["x"], np.concatenate([noise + k for k in range(4)])
         )
     assert not list(tmp_path.glob("*.part"))
+
+
+def test_memory_of_a_writer_does_not_grow_with_the_archive(tmp_path):
+    still = np.full((4, 50, 1), 0.25)
+    fields = {"x": FieldSpec(Bound("exact"))}
+    held = []
+    with ArchiveWriter(tmp_path / "a.tta", fields) as writer:
+        tracemalloc.start()
+        for k in range(600):
+            steps = np.arange(4 * k, 4 * k + 4)
+            writer.append(Chunk(steps, steps * 1.0, (Block(np.arange(50), {"x": still}),)))
+            if k in (99, 599):
+                gc.collect()
+                held.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+    # Not even a number of 8 bytes more for each of 500 chunks.
+    assert held[1] - held[0] < 4000
 
 
 def test_existing_files_and_second_writers_are_refused(tmp_path, chunks):
