@@ -169,9 +169,14 @@ class Curve:
         return (min(choices), nearest) if choices else None
 
     def _close_in(self, chunk: int, layout: Layout, error: float, count: int) -> None:
-        """Try bounds until one has an error within MATCHED of `error`, or TRIALS of them."""
-        for _ in range(TRIALS):
+        """Try bounds until one has an error within MATCHED of `error`, or TRIALS of them.
+
+        More are tried while no error is small enough: in steady motion errors hardly follow bounds.
+        """
+        for trial in range(4 * TRIALS):
             points = self.known(chunk, layout)
+            if trial >= TRIALS and points[0].error <= error:
+                return
             if points and points[0].error <= error and _any_matches(points, error):
                 return
             bound = _next_bound(points, 0.99 * error, error / math.sqrt(count))
@@ -198,8 +203,10 @@ def _next_bound(points: list[Point], error: float, first: float) -> float:
         x = math.log(error / low.error) / math.log(high.error / low.error)
         # Never close to an end: an error that grows in steps would not let the other end move.
         return low.bound * (high.bound / low.bound) ** min(max(x, 0.1), 0.9)
-    end = below[-1] if below else above[0]
-    return end.bound * min(max(error / end.error, 1e-2), 1e2)
+    if below:
+        return below[-1].bound * min(error / below[-1].error, 1e2)
+    smallest = min(above, key=lambda point: point.bound)
+    return smallest.bound * min(max(error / smallest.error, 1e-2), 0.9)
 
 
 def _interpolated(points: list[Point], error: float) -> float | None:
