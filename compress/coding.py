@@ -262,12 +262,13 @@ class Encoder:
             or last.coder not in names
             or self.memory.chunks % self.settings.trial_every == 0
         ):
-            return _smallest(_promising(names, values, target), values, target, context, present)
+            names = _promising(names, values, target, context)
+            return _smallest(names, values, target, context, present)
         best = _smallest((last.coder,), values, target, context, present)
         rate = Winner.of(best[0].coder, len(best[0].data), best[0].errors).rate
         if best[0].coder != last.coder or not last.rate / JUMP <= rate <= last.rate * JUMP:
             # Another phase of the flow may have begun, in which another coder pays.
-            rest = tuple(n for n in _promising(names, values, target) if n != last.coder)
+            rest = tuple(n for n in _promising(names, values, target, context) if n != last.coder)
             best = min(best, _smallest(rest, values, target, context, present), key=_length)
         return best
 
@@ -276,7 +277,9 @@ def _length(result: tuple[CodedField, NDArray]) -> int:
     return len(result[0].data)
 
 
-def _promising(names: Sequence[str], values: NDArray, target: Target) -> tuple[str, ...]:
+def _promising(
+    names: Sequence[str], values: NDArray, target: Target, context: coders.Context
+) -> tuple[str, ...]:
     """Without those coders that take far more than the others on a sample of the bodies."""
     bodies = values.shape[1]
     if target.exact or bodies < 4 * SAMPLE:
@@ -288,8 +291,9 @@ def _promising(names: Sequence[str], values: NDArray, target: Target) -> tuple[s
     sample = values[:, rows]
     share = replace(target, frobenius=target.frobenius * math.sqrt(SAMPLE / bodies))
     # What needs more than the values is as good as what does not.
-    sized = [name for name in names if name in ("tt", "predictive", "qtt")]
-    sizes = {name: len(coders.encode(name, sample, share) or sample.tobytes()) for name in sized}
+    known = coders.Context(None if context.guide is None else context.guide[:, rows])
+    sized = [name for name in names if name in ("tt", "predictive", "qtt", coders.GUIDED)]
+    sizes = {n: len(coders.encode(n, sample, share, known) or sample.tobytes()) for n in sized}
     fewest = min(sizes.values())
     return tuple(n for n in names if sizes.get(n, 0) <= PROMISING * fewest)
 
