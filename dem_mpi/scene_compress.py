@@ -53,9 +53,9 @@ FieldBound = Annotated[
 
 
 def _bound(text: str) -> Any:
-    return note(
-        f"{text}: a relative error (a plain number), a mapping with one of relative, rmse and "
-        "pointwise, or exact",
+    return quantity(
+        "1",
+        f"{text}: a relative error, a mapping with one of relative, rmse and pointwise, or exact",
         default=None,
     )
 
@@ -63,12 +63,12 @@ def _bound(text: str) -> Any:
 class CompressedFields(Model):
     """What is archived; gid always is, exactly."""
 
-    position: FieldBound | None = _bound("Centre of mass [m]")
-    velocity: FieldBound | None = _bound("Velocity of the centre of mass [m/s]")
-    angular_velocity: FieldBound | None = _bound("Angular velocity [rad/s]")
-    orientation: FieldBound | None = _bound("Unit quaternion, body to world [1]")
-    radius: FieldBound | None = _bound("Radius [m]")
-    half_length: FieldBound | None = _bound("Half the core or polar semi-axis [m]")
+    position: FieldBound | None = _bound("Centre of mass in m")
+    velocity: FieldBound | None = _bound("Velocity of the centre of mass in m/s")
+    angular_velocity: FieldBound | None = _bound("Angular velocity in rad/s")
+    orientation: FieldBound | None = _bound("Unit quaternion, body to world")
+    radius: FieldBound | None = _bound("Radius in m")
+    half_length: FieldBound | None = _bound("Half the core or polar semi-axis in m")
     shape: Literal["exact"] | None = note("Number of the shape: exact", default=None)
     material: Literal["exact"] | None = note("Number of the material: exact", default=None)
 
