@@ -16,6 +16,7 @@ LEVELS = 31  # contexts: activities grow by 1.5 from one to the next
 CAP = 1 << 20  # larger residuals count as this in activities
 SPAN = 15  # residuals up to this have a price of their own; beyond, logarithmic
 LARGE = 1e300
+GLANCE = 6  # steps that a greedy path looks at, this one included
 
 
 def _level_of_small(size: int = 4096) -> NDArray:
@@ -142,6 +143,26 @@ def flight_ends(x, drift, ends, share):
 
 
 @jit
+def flights(x, drift, ends):
+    """How many steps of each body follow the drift, 0 for bodies that soon leave it.
+
+    As `flight_ends` finds them. x : (T, n, w); ends : (n,) int64 out
+    """
+    steps, bodies, width = x.shape
+    largest = 0.0
+    for c in range(width):
+        largest = max(largest, abs(drift[c]))
+    for i in range(bodies):
+        ends[i] = steps
+    for t in range(1, steps):
+        for i in range(bodies):
+            if ends[i] == steps:
+                for c in range(width):
+                    if abs(x[t, i, c] - x[t - 1, i, c] - drift[c]) > 0.5 * largest:
+                        ends[i] = t if t > 2 else 0
+
+
+@jit
 def choose_paths(x, guide, start, drift, step, weight, prices, flags, maximum, ends, share, r):
     """Integer paths of all bodies, and how far each one follows the drift.
 
@@ -208,6 +229,103 @@ def choose_paths(x, guide, start, drift, step, weight, prices, flags, maximum, e
 
 
 @jit
+def greedy_paths(x, guide, start, drift, step, weight, prices, maximum, ends, r, sums, counts):
+    """Integer paths of all bodies, each level chosen with a glance at the next few steps alone.
+
+    A path holds its level within half a step of the value, and goes to the nearest one from a
+    whole step on. In between it moves where the squared error that this saves, until the value
+    comes back, is worth the price of moving. As good as `choose_paths` to some per cent of the
+    bits, in one pass along time, in which go the sums of `centroid_sums` and the counts of
+    `count_residuals` too.
+
+    x, guide : (T, n, w), guide (T, 0, w) for none; ends : (n,) steps that follow the drift;
+    r : (T, w, n) int64 out; sums : (5, 3) out; counts : (w, LEVELS + 1, 2 SPAN + 1) out
+    """
+    steps, bodies, width = x.shape
+    inverse = 1.0 / step
+    q = np.zeros((bodies, width), np.int64)
+    memory = np.zeros((bodies, width), np.int64)
+    error = np.zeros((bodies, width))
+    by_signs = np.zeros((9, 3))
+    for t in range(steps):
+        for i in range(bodies):
+            activity = 0
+            if t > 1:
+                for c in range(width):
+                    activity += 4 * min(abs(r[t - 1, c, i]), CAP)
+            for c in range(width):
+                last = r[t - 1, c, i] if t > 1 else 0
+                level = LEVELS
+                if t > 0:
+                    level = level_of(activity + memory[i, c] + 4 * min(abs(last), CAP))
+                off = (x[t, i, c] - _offset(guide, start, drift, ends, t, i, c)) * inverse - q[i, c]
+                value = 0
+                if t == 0 or abs(off) >= 1.0:
+                    value = int(np.floor(off + 0.5))
+                elif abs(off) > 0.5:
+                    move = 1 if off > 0.0 else -1
+                    gain = 2.0 * abs(off) - 1.0
+                    price = _price(prices[c], level, move, last) - prices[c, level, SPAN]
+                    if abs(off) * step > maximum:
+                        price = 0.0
+                    ahead = t + 1
+                    while gain < weight * price and ahead < min(t + GLANCE, steps):
+                        then = (
+                            x[ahead, i, c] - _offset(guide, start, drift, ends, ahead, i, c)
+                        ) * inverse - q[i, c]
+                        if then * move <= 0.5:
+                            break
+                        gain += 2.0 * then * move - 1.0
+                        ahead += 1
+                    if gain >= weight * price:
+                        value = move
+                r[t, c, i] = value
+                q[i, c] += value
+                if t > 0:
+                    # Signs of the residuals before and behind the entry whose error is known.
+                    signs = 3 * ((last > 0) - (last < 0)) + (value > 0) - (value < 0) + 4
+                    e = error[i, c]
+                    by_signs[signs, 0] += 1.0
+                    by_signs[signs, 1] += e
+                    by_signs[signs, 2] += e * e
+                error[i, c] = off - value
+                size = min(abs(value), CAP)
+                activity += 8 * size
+                memory[i, c] = (memory[i, c] >> 1) + 4 * size if t > 0 else size
+                folded = -value if last < 0 else value
+                counts[c, level, min(max(folded, -SPAN), SPAN) + SPAN] += 1.0
+    for i in range(bodies):
+        for c in range(width):
+            last = r[steps - 1, c, i] if steps > 1 else 0
+            _add_share(sums, class_of(last, 0), error[i, c])
+    for before in range(-1, 2):
+        for after in range(-1, 2):
+            kind = class_of(before, after)
+            part = by_signs[3 * before + after + 4]
+            sums[abs(kind), 0] += part[0]
+            sums[abs(kind), 1] += part[1] if kind >= 0 else -part[1]
+            sums[abs(kind), 2] += part[2]
+
+
+@jit
+def _offset(guide, start, drift, ends, t, i, c):
+    """The value of an entry at level 0; guide : (T, n, w), or (T, 0, w) for none."""
+    offset = start[c] + drift[c] * min(t, max(ends[i] - 1, 0))
+    return offset + guide[t, i, c] if guide.shape[1] > 0 else offset
+
+
+@jit
+def _add_share(sums, kind, error):
+    """Add an error of a class to the sums of `centroid_sums`."""
+    k = abs(kind)
+    if kind < 0:
+        error = -error
+    sums[k, 0] += 1.0
+    sums[k, 1] += error
+    sums[k, 2] += error * error
+
+
+@jit
 def count_residuals(r, counts):
     """Count residuals by context, for prices: counts (w, LEVELS + 1, 2 SPAN + 1) += 1."""
     bodies, width, steps = r.shape
@@ -259,6 +377,50 @@ def levels_now(now, last, memory, component, first, out):
 
 
 @jit
+def arrange(now, last, levels, component, symbols, widths, counts):
+    """Symbols and open bits as of `fold`, those of one context side by side, in order of bodies.
+
+    now, last : (w, n) residuals; levels : (n,) uint8; symbols : (n,) int32 out;
+    widths : (n,) int64 out, in the order of bodies; counts : (contexts,) int64 out
+    Returns the largest width.
+    """
+    widest = 0
+    counts[:] = 0
+    for i in range(len(levels)):
+        counts[levels[i]] += 1
+    place = np.zeros(len(counts), np.int64)
+    for k in range(1, len(counts)):
+        place[k] = place[k - 1] + counts[k - 1]
+    for i in range(len(levels)):
+        symbol, widths[i] = _symbol(now[component, i], last[component, i])
+        symbols[place[levels[i]]] = symbol
+        place[levels[i]] += 1
+        widest = max(widest, widths[i])
+    return widest
+
+
+@jit
+def low_bits(residual, widths, width):
+    """What residuals (n,) leave open, (m,) uint64, of those that leave `width` bits open."""
+    found = np.empty(len(residual), np.uint64)
+    count = 0
+    for i in range(len(residual)):
+        if widths[i] == width:
+            found[count] = abs(residual[i]) & ((1 << width) - 1)
+            count += 1
+    return found[:count]
+
+
+@jit
+def count_symbols(symbols, prior, counts, weights):
+    """Add symbols (m,) int32 to the counts of a table; weights = prior + counts, all (size,)."""
+    for symbol in symbols:
+        counts[symbol] += 1.0
+    for k in range(len(counts)):
+        weights[k] = prior[k] + counts[k]
+
+
+@jit
 def remember(now, first, last, memory):
     """Pass on to the next step: memory fades by half, `last` becomes `now`; all (w, n) int64.
 
@@ -280,17 +442,22 @@ def fold(residual, last, symbols, widths):
     the sign of `last` and against it; widths : (n,) int64 out
     """
     for i in range(len(residual)):
-        r = -residual[i] if last[i] < 0 else residual[i]
-        u = abs(r)
-        width = 0
-        while (u >> width) >= DIRECT:
-            width += 1
-        b = u
-        if width > 0:
-            # 16 buckets a power of two: the five leading digits.
-            b = DIRECT + (width - 1) * PARTS + ((u >> width) - PARTS)
-        symbols[i] = 2 * b - (1 if r > 0 else 0)
-        widths[i] = width
+        symbols[i], widths[i] = _symbol(residual[i], last[i])
+
+
+@jit
+def _symbol(residual, last):
+    """The symbol of a residual, and how many low bits it leaves open."""
+    r = -residual if last < 0 else residual
+    u = abs(r)
+    width = 0
+    while (u >> width) >= DIRECT:
+        width += 1
+    b = u
+    if width > 0:
+        # 16 buckets a power of two: the five leading digits.
+        b = DIRECT + (width - 1) * PARTS + ((u >> width) - PARTS)
+    return 2 * b - (1 if r > 0 else 0), width
 
 
 @jit
@@ -325,13 +492,7 @@ def centroid_sums(x, guide, start, drift, step, ends, r, sums):
                 error = (x[i, c, t] - offset) / step - q
                 before = r[i, c, t] if t > 0 else 0
                 after = r[i, c, t + 1] if t + 1 < steps else 0
-                kind = class_of(before, after)
-                k = abs(kind)
-                if kind < 0:
-                    error = -error
-                sums[k, 0] += 1.0
-                sums[k, 1] += error
-                sums[k, 2] += error * error
+                _add_share(sums, class_of(before, after), error)
 
 
 @jit
@@ -352,24 +513,41 @@ def class_of(before, after):
 def reconstruct(guide, start, drift, step, table, ends, r, steps, out):
     """Values from residuals: start + drift min(t, end - 1) + guide + step (q + shift).
 
-    guide : (n, w, T) or (0, w, T); start, drift : (w,); table : (5,) shifts by class;
+    guide : (T, n, w) or (T, 0, w); start, drift : (w,); table : (5,) shifts by class;
     ends : (n,); r : (T', w, n) int64, of one step more than asked for unless that is the last;
     out : (steps, n, w). Single operations in this order: the bits are part of the format.
     """
     known, width, bodies = r.shape
     q = np.zeros((width, bodies), np.int64)
+    shift = np.empty(9)
+    for before in range(-1, 2):
+        for after in range(-1, 2):
+            kind = class_of(before, after)
+            shift[3 * before + after + 4] = table[kind] if kind >= 0 else -table[-kind]
     for t in range(steps):
         for i in range(bodies):
-            flown = min(t, max(ends[i] - 1, 0))
             for c in range(width):
                 q[c, i] += r[t, c, i]
+                before = r[t, c, i] if t > 0 else 0
                 after = r[t + 1, c, i] if t + 1 < known else 0
-                kind = class_of(r[t, c, i] if t > 0 else 0, after)
-                level = q[c, i] + (table[kind] if kind >= 0 else -table[-kind])
-                offset = start[c] + drift[c] * flown
-                if len(guide):
-                    offset += guide[i, c, t]
-                out[t, i, c] = offset + step * level
+                signs = 3 * ((before > 0) - (before < 0)) + (after > 0) - (after < 0) + 4
+                offset = _offset(guide, start, drift, ends, t, i, c)
+                out[t, i, c] = offset + step * (q[c, i] + shift[signs])
+
+
+@jit
+def largest(values):
+    """The largest magnitude in an array (T, n, w), NaN if there is one."""
+    found = 0.0
+    for t in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            for c in range(values.shape[2]):
+                size = abs(np.float64(values[t, i, c]))
+                if not size <= found:
+                    if np.isnan(size):
+                        return size
+                    found = size
+    return found
 
 
 @jit

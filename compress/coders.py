@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from compress import permutation, predictive, raw, tt_coder
 from compress.bounds import Target
+from compress.effort import BEST, Effort
 
 # In files a coder is its place in this list: only append to it.
 CODERS = ("exact", "constant", "predictive", "guided", "tt", "qtt")
@@ -46,24 +47,50 @@ class Context:
 NOTHING = Context()
 
 
-def candidates(target: Target, context: Context = NOTHING) -> tuple[str, ...]:
+def candidates(
+    target: Target, context: Context = NOTHING, effort: Effort = BEST
+) -> tuple[str, ...]:
     """The coders worth a trial for a target, the cheaper ones first."""
     if target.exact:
         return ("constant", "exact")
     guided = () if context.guide is None else (GUIDED,)
-    return ("constant", "tt", "predictive", *guided, "qtt")
+    return ("constant", "tt", "predictive", *guided, *(("qtt",) if effort.thorough else ()))
 
 
-def encode(name: str, values: NDArray, target: Target, context: Context = NOTHING) -> bytes | None:
+def encode(
+    name: str,
+    values: NDArray,
+    target: Target,
+    context: Context = NOTHING,
+    effort: Effort = BEST,
+) -> bytes | None:
     """Values (T, n, w) in bytes, None where the coder has no use for them."""
+    return encode_and_decode(name, values, target, context, effort)[0]
+
+
+def encode_and_decode(
+    name: str,
+    values: NDArray,
+    target: Target,
+    context: Context = NOTHING,
+    effort: Effort = BEST,
+) -> tuple[bytes | None, NDArray | None]:
+    """As `encode`, and what `decode` makes of it where the coder knows that without decoding."""
+    if name in ("predictive", GUIDED):
+        guide = context.guide if name == GUIDED else None
+        data, decoded = predictive.encode_and_decode(values, target, guide=guide, effort=effort)
+        paths = data[0] % predictive.SINGLE == predictive.PATHS
+        return (data, decoded) if paths else (None, None)
+    return _encode(name, values, target, context, effort), None
+
+
+def _encode(
+    name: str, values: NDArray, target: Target, context: Context, effort: Effort
+) -> bytes | None:
     if name == "exact":
         return raw.encode(values)
     if name == "constant":
         return _encode_constant(values, target)
-    if name in ("predictive", GUIDED):
-        guide = context.guide if name == GUIDED else None
-        data = predictive.encode(values, target, guide=guide)
-        return data if data[0] % predictive.SINGLE == predictive.PATHS else None
     if name == "tt":
         data = tt_coder.encode(values, target)
         return data if tt_coder.pays(data) else None

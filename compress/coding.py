@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from compress import coders
 from compress.bounds import Bound, Errors, Target, measure, norm
+from compress.effort import EFFORTS, Effort
 from compress.tensorize import morton_order
 from dem_mpi.errors import InputError
 
@@ -45,19 +46,23 @@ class Settings:
 
     floor [unit of the field]: relative bounds do not shrink below this times the root mean square
     of all chunks so far; trial_every: chunks between trials of all coders; step_size [s]: time
-    between two step numbers, 0 if unknown
+    between two step numbers, 0 if unknown; effort: "best" or "fast", how much time is spent on
+    fewer bytes, of which fast takes up to 15 % more. Raises ValueError for another effort.
     """
 
     floor: float = 0.0
     trial_every: int = 1
     step_size: float = 0.0
+    effort: str = "best"
+
+    def __post_init__(self) -> None:
+        if self.effort not in EFFORTS:
+            raise ValueError(f"effort {self.effort!r}: must be one of {', '.join(EFFORTS)}")
 
 
 DEFAULT_SETTINGS = Settings()
 # Bytes an entry that change by this factor from chunk to chunk call for another trial.
 JUMP = 1.5
-# Coders that take this many times the fewest bytes on a sample of bodies are not tried on all.
-PROMISING = 1.5
 SAMPLE = 1024
 RUNS = 16  # of consecutive bodies, that a sample consists of
 
@@ -255,71 +260,97 @@ class Encoder:
         present: NDArray | None,
     ) -> tuple[CodedField, NDArray]:
         """The field in the fewest bytes, and what they decode to."""
-        names = coders.candidates(target, context)
+        effort = EFFORTS[self.settings.effort]
+        names = coders.candidates(target, context, effort)
         last = self.memory.winners.get(name)
-        if (
-            last is None
-            or last.coder not in names
-            or self.memory.chunks % self.settings.trial_every == 0
-        ):
-            names = _promising(names, values, target, context)
-            return _smallest(names, values, target, context, present)
-        best = _smallest((last.coder,), values, target, context, present)
-        rate = Winner.of(best[0].coder, len(best[0].data), best[0].errors).rate
-        if best[0].coder != last.coder or not last.rate / JUMP <= rate <= last.rate * JUMP:
+        periodic = self.memory.chunks % self.settings.trial_every == 0
+        # A trial is also when what an encoder says of its decoder is put to the test.
+        task = _Task(values, target, context, present, effort, decode=periodic)
+        if last is None or last.coder not in names or periodic:
+            return task.smallest(task.promising(names)) or task.exact()
+        best = task.smallest((last.coder,))
+        rate = math.inf
+        if best is not None:
+            rate = Winner.of(best[0].coder, len(best[0].data), best[0].errors).rate
+        if not last.rate / JUMP <= rate <= last.rate * JUMP:
             # Another phase of the flow may have begun, in which another coder pays.
-            rest = tuple(n for n in _promising(names, values, target, context) if n != last.coder)
-            best = min(best, _smallest(rest, values, target, context, present), key=_length)
-        return best
+            rest = tuple(n for n in task.promising(names) if n != last.coder)
+            found = [result for result in (best, task.smallest(rest)) if result is not None]
+            best = min(found, key=_length, default=None)
+        return best or task.exact()
 
 
 def _length(result: tuple[CodedField, NDArray]) -> int:
     return len(result[0].data)
 
 
-def _promising(
-    names: Sequence[str], values: NDArray, target: Target, context: coders.Context
-) -> tuple[str, ...]:
-    """Without those coders that take far more than the others on a sample of the bodies."""
-    bodies = values.shape[1]
-    if target.exact or bodies < 4 * SAMPLE:
-        return tuple(names)
-    # Neighbours together, for coders that use them, from all parts of the block: gids often go
-    # by place, and a bed lands from below.
-    starts = np.linspace(0, bodies - SAMPLE // RUNS, RUNS).astype(np.int64)
-    rows = (starts[:, None] + np.arange(SAMPLE // RUNS)).ravel()
-    sample = values[:, rows]
-    share = replace(target, frobenius=target.frobenius * math.sqrt(SAMPLE / bodies))
-    # What needs more than the values is as good as what does not.
-    known = coders.Context(None if context.guide is None else context.guide[:, rows])
-    sized = [name for name in names if name in ("tt", "predictive", "qtt", coders.GUIDED)]
-    sizes = {n: len(coders.encode(n, sample, share, known) or sample.tobytes()) for n in sized}
-    fewest = min(sizes.values())
-    return tuple(n for n in names if sizes.get(n, 0) <= PROMISING * fewest)
+@dataclass(frozen=True)
+class _Task:
+    """A field of a block to be coded: values (T, n, w), what they have to meet, and how.
 
+    present : (T, n) whether each body is there, None: all are; decode: whether to decode even what
+    an encoder says it decodes to
+    """
 
-def _smallest(
-    names: Sequence[str],
-    values: NDArray,
-    target: Target,
-    context: coders.Context,
-    present: NDArray | None,
-) -> tuple[CodedField, NDArray]:
-    """Of the coders named, the result in fewest bytes that keeps to the target; exact if none."""
-    best = None
-    for name in names:
-        data = coders.encode(name, values, target, context)
-        if data is None or (best is not None and len(data) >= len(best[0].data)):
-            continue
-        decoded = coders.decode(name, data, values.dtype, values.shape, context.guide)
-        errors = _measure(values, decoded, present)
-        if target.met_by(errors) if not target.exact else _same_bits(values, decoded):
-            best = CodedField(name, data, errors), decoded
-    if best is not None:
+    values: NDArray
+    target: Target
+    context: coders.Context
+    present: NDArray | None
+    effort: Effort
+    decode: bool
+
+    def promising(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Without those coders that take far more than the others on a sample of the bodies."""
+        bodies = self.values.shape[1]
+        if self.target.exact or bodies < 4 * SAMPLE:
+            return tuple(names)
+        # Neighbours together, for coders that use them, from all parts of the block: gids often go
+        # by place, and a bed lands from below.
+        starts = np.linspace(0, bodies - SAMPLE // RUNS, RUNS).astype(np.int64)
+        rows = (starts[:, None] + np.arange(SAMPLE // RUNS)).ravel()
+        sample = self.values[:, rows]
+        share = replace(self.target, frobenius=self.target.frobenius * math.sqrt(SAMPLE / bodies))
+        guide = self.context.guide
+        known = coders.Context(None if guide is None else guide[:, rows])
+        sized = [name for name in names if name in ("tt", "predictive", "qtt", coders.GUIDED)]
+        codes = {n: coders.encode(n, sample, share, known, self.effort) for n in sized}
+        # What needs more than the values is as good as what does not.
+        sizes = {n: sample.nbytes if code is None else len(code) for n, code in codes.items()}
+        most = self.effort.promising * min(sizes.values())
+        return tuple(n for n in names if sizes.get(n, 0) <= most)
+
+    def smallest(self, names: Sequence[str]) -> tuple[CodedField, NDArray] | None:
+        """Of the coders named, the result in fewest bytes that keeps to the target."""
+        best = None
+        for name in names:
+            data, decoded = coders.encode_and_decode(
+                name, self.values, self.target, self.context, self.effort
+            )
+            if data is None or (best is not None and len(data) >= len(best[0].data)):
+                continue
+            if decoded is None or self.decode:
+                decoded = self._decoded(name, data, decoded)
+            errors = _measure(self.values, decoded, self.present)
+            if (
+                self.target.met_by(errors)
+                if not self.target.exact
+                else _same_bits(self.values, decoded)
+            ):
+                best = CodedField(name, data, errors), decoded
         return best
-    data = coders.encode("exact", values, target)
-    assert data is not None
-    return CodedField("exact", data, _measure(values, values, present)), values
+
+    def exact(self) -> tuple[CodedField, NDArray]:
+        """The result that every field has: every bit kept."""
+        data = coders.encode("exact", self.values, self.target)
+        assert data is not None
+        errors = _measure(self.values, self.values, self.present)
+        return CodedField("exact", data, errors), self.values
+
+    def _decoded(self, name: str, data: bytes, expected: NDArray | None) -> NDArray:
+        values = self.values
+        decoded = coders.decode(name, data, values.dtype, values.shape, self.context.guide)
+        assert expected is None or _same_bits(expected, decoded), f"{name}: decodes otherwise"
+        return decoded
 
 
 def _spatial_order(block: Block, ends: NDArray | None) -> Callable[[], NDArray] | None:

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from compress import _kernels_predictive as kernels
 from compress.bounds import Target
+from compress.effort import BEST, Effort
 from compress.entropy import (
     LAST_BUCKET,
     LIMIT,
@@ -52,8 +53,6 @@ CONTEXTS = kernels.LEVELS + (kernels.LEVELS + 1) // 2
 COMPONENTS = 6  # from this one on, components share their tables
 PRIOR_WEIGHT = 12.0
 SHIFT_UNIT = 1.0 / 128.0
-SAMPLE = 2048  # bodies on which the step width is sought first
-USED = 0.985  # share of the error allowed that is worth another trial
 TRIALS = 10
 LARGEST_PATH = 2.0**45  # levels: their exact float64, with shifts, ends here
 
@@ -92,6 +91,7 @@ def encode(
     *,
     guide: NDArray | None = None,
     start: NDArray | None = None,
+    effort: Effort = BEST,
 ) -> bytes:
     """Code a block within the target.
 
@@ -100,6 +100,18 @@ def encode(
     the block before. The decoder needs the same bits of both.
     Raises ValueError for a target of zero and for values that are not finite.
     """
+    return encode_and_decode(values, target, guide=guide, start=start, effort=effort)[0]
+
+
+def encode_and_decode(
+    values: NDArray,
+    target: Target,
+    *,
+    guide: NDArray | None = None,
+    start: NDArray | None = None,
+    effort: Effort = BEST,
+) -> tuple[bytes, NDArray]:
+    """As `encode`, and what `decode` makes of the bytes, to the last bit, without decoding them."""
     values = np.asarray(values)
     if values.ndim != 3:
         raise ValueError(f"block of shape {values.shape}: must be (steps, bodies, components)")
@@ -107,17 +119,16 @@ def encode(
         values = values.astype(np.float64, copy=False)
     if target.exact:
         raise ValueError("predictive coding loses digits: the target must allow an error")
-    if not np.isfinite(values).all():
+    if not math.isfinite(kernels.largest(values)):
         where = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
         raise ValueError(f"value at (step, body, component) = {where} is not finite")
     if not values.size:
-        return _encode_raw(values)
-    x = np.ascontiguousarray(values.transpose(1, 2, 0), dtype=np.float64)
+        return _encode_raw(values), values
     ahead = _predictions(values.shape, guide, start)
-    coded = _encode_paths(values, x, ahead, target)
-    if coded is None or len(coded) > 0.8 * values.nbytes:
+    coded = _encode_paths(values, ahead, target, effort)
+    if coded is None or len(coded[0]) > 0.8 * values.nbytes:
         raw = _encode_raw(values)
-        return raw if coded is None or len(raw) < len(coded) else coded
+        return (raw, values) if coded is None or len(raw) < len(coded[0]) else coded
     return coded
 
 
@@ -153,93 +164,157 @@ def decode(
 
 
 def _predictions(shape: tuple[int, int, int], guide: NDArray | None, start: NDArray | None):
-    """What is known of the values beforehand, (n, w, T) float64, or (0, w, T) where nothing is."""
+    """What is known of the values beforehand, (T, n, w) float64, or (T, 0, w) where nothing is."""
     steps, bodies, width = shape
     if guide is None and start is None:
-        return np.empty((0, width, steps))
-    ahead = np.zeros((steps, bodies, width))
+        return np.empty((steps, 0, width))
+    ahead = np.empty((steps, bodies, width))
+    ahead[0] = 0.0
     if guide is not None:
         if guide.ndim != 3 or guide.shape[1:] != shape[1:] or len(guide) < steps:
             raise ValueError(f"guide of shape {guide.shape} for a block of shape {shape}")
         ahead[1:] = guide[1:steps]
+    else:
+        ahead[1:] = 0.0
     if start is not None:
         if start.shape != shape[1:]:
             raise ValueError(f"start of shape {start.shape} for a block of shape {shape}")
         ahead[0] = start
     # One addition after the other along time: the same bits everywhere.
-    return np.ascontiguousarray(np.add.accumulate(ahead, axis=0).transpose(1, 2, 0))
+    for t in range(1, steps):
+        ahead[t] += ahead[t - 1]
+    return ahead
 
 
 # ---- choice of step width and paths
 
 
-def _encode_paths(values: NDArray, x: NDArray, ahead: NDArray, target: Target) -> bytes | None:
-    """The block as paths, or None where that cannot meet the target. x : (n, w, T) of `values`."""
-    bodies, width, _ = x.shape
-    largest = float(np.abs(x).max())
-    goal = target.rmse(x.size)
+def _encode_paths(
+    values: NDArray, ahead: NDArray, target: Target, effort: Effort
+) -> tuple[bytes, NDArray] | None:
+    """The block as paths and what that decodes to, or None where they cannot meet the target.
+
+    values : (T, n, w); ahead : (T, n, w), or (T, 0, w)
+    """
+    _, bodies, width = values.shape
+    largest = kernels.largest(values)
+    goal = target.rmse(values.size)
     cap = min(2.0 * target.maximum, 8.0 * largest if largest > 0.0 else math.inf)
     step = min(math.sqrt(12.0) * goal, cap if math.isfinite(cap) else 1.0)
     if not 1e-303 < step < 1e304 or largest > LARGEST_PATH * step:
         return None
+    stride = max(1, bodies // effort.sample)
+    near = _Paths.of(values[:, ::stride], ahead[:, ::stride], effort)
     start, drift = np.zeros(width), np.zeros(width)
-    if not len(ahead):
-        start = np.median(x[:, :, 0], axis=0)
-        drift = _find_drift(x)
+    if not ahead.size:
+        start = np.median(values[0], axis=0).astype(np.float64)
+        drift = _find_drift(near.values)
     search = _Search(_first_prices(width), np.array([1.0, 6.0, 1.0]), 0.15, target.maximum)
-    sample = slice(None, None, max(1, bodies // SAMPLE))
-    near, near_ahead = np.ascontiguousarray(x[sample]), np.ascontiguousarray(ahead[sample])
-    trial = _calibrate(near, near_ahead, start, drift, step, search, goal, cap)
+    trial = _calibrate(near, start, drift, step, search, goal, cap)
     if not np.any(trial.layout.ends):
         drift = np.zeros(width)
-    return _meet(values, x, ahead, start, drift, trial, target, cap)
+    return _meet(_Paths.of(values, ahead, effort), start, drift, trial, target, cap)
+
+
+@dataclass(frozen=True)
+class _Paths:
+    """A block and what is known of it, as kernels want them.
+
+    given : (T, n, w) float32 or float64; values : the same as float64; ahead : as `_predictions`;
+    along : both as (n, w, T) for a search along the time of each body, None for a greedy one
+    """
+
+    given: NDArray
+    values: NDArray
+    ahead: NDArray
+    along: tuple[NDArray, NDArray] | None
+    effort: Effort
+
+    @classmethod
+    def of(cls, values: NDArray, ahead: NDArray, effort: Effort) -> _Paths:
+        """That of a block, or of some bodies of it."""
+        given, ahead = np.ascontiguousarray(values), np.ascontiguousarray(ahead)
+        values = given.astype(np.float64, copy=False)
+        along = None
+        if effort.thorough:
+            along = _body_by_body(values), _body_by_body(ahead)
+        return cls(given, values, ahead, along, effort)
+
+
+def _body_by_body(values: NDArray) -> NDArray:
+    """(n, w, T) of (T, n, w)."""
+    return np.ascontiguousarray(values.transpose(1, 2, 0))
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """Paths r (n, w, T) found with a layout, their root mean square error, and what led there."""
+    """Paths r (T, w, n) found with a layout, their root mean square error, how many residuals there
+    are in each context, (w, levels + 1, residuals), and what led there.
+    """
 
     layout: Layout
     residuals: NDArray
     rmse: float
+    counts: NDArray
     search: _Search
 
 
-def _try(x, ahead, start, drift, step: float, search: _Search) -> _Trial:
-    """Choose the paths at one step width. x, ahead : (n, w, T); start, drift : (w,)."""
-    bodies, width, steps = x.shape
+def _try(block: _Paths, start: NDArray, drift: NDArray, step: float, search: _Search) -> _Trial:
+    """Choose the paths at one step width. start, drift : (w,)."""
+    steps, bodies, width = block.values.shape
     step = _rounded_step(step)
     unit_start, unit_drift = _units(step, steps)
     start = np.rint(start / unit_start) * unit_start
     drift = np.rint(drift / unit_drift) * unit_drift
     # Where it does not leave the level, it is no drift.
     drift = np.where(np.abs(drift) * steps > 0.5 * step, drift, 0.0)
-    ends, share = np.zeros(bodies, np.int64), np.zeros(bodies)
-    if drift.any():
-        kernels.flight_ends(x, drift, ends, share)
-    residuals = np.empty(x.shape, np.int64)
-    kernels.choose_paths(
-        x, ahead, start, drift, step, search.weight, search.prices, search.flags,
-        search.maximum, ends, share, residuals,
-    )  # fmt: skip
-    sums = np.zeros((5, 3))
-    kernels.centroid_sums(x, ahead, start, drift, step, ends, residuals, sums)
+    ends, sums = np.zeros(bodies, np.int64), np.zeros((5, 3))
+    counts = np.zeros((width, kernels.LEVELS + 1, 2 * kernels.SPAN + 1))
+    if block.along is None:
+        if drift.any():
+            kernels.flights(block.values, drift, ends)
+        residuals = np.empty((steps, width, bodies), np.int64)
+        kernels.greedy_paths(
+            block.values, block.ahead, start, drift, step, search.weight, search.prices,
+            search.maximum, ends, residuals, sums, counts,
+        )  # fmt: skip
+    else:
+        x, ahead = block.along
+        share = np.zeros(bodies)
+        if drift.any():
+            kernels.flight_ends(x, drift, ends, share)
+        paths = np.empty(x.shape, np.int64)
+        kernels.choose_paths(
+            x, ahead, start, drift, step, search.weight, search.prices, search.flags,
+            search.maximum, ends, share, paths,
+        )  # fmt: skip
+        kernels.centroid_sums(x, ahead, start, drift, step, ends, paths, sums)
+        kernels.count_residuals(paths, counts)
+        residuals = np.ascontiguousarray(paths.transpose(2, 1, 0))
     means = sums[:, 1] / np.maximum(sums[:, 0], 1.0)
     shifts = np.zeros(5)
     if search.maximum == math.inf:
         shifts[1:] = np.clip(np.rint(means[1:] / SHIFT_UNIT), -127, 127) * SHIFT_UNIT
     squares = sums[:, 2] - 2.0 * shifts * sums[:, 1] + shifts**2 * sums[:, 0]
-    rmse = math.sqrt(max(float(squares.sum()), 0.0) / x.size) * step
+    rmse = math.sqrt(max(float(squares.sum()), 0.0) / residuals.size) * step
     layout = Layout((steps, bodies, width), step, start, drift, shifts, ends)
-    return _Trial(layout, residuals, rmse, search)
+    return _Trial(layout, residuals, rmse, counts, search)
 
 
-def _calibrate(x, ahead, start, drift, step, search: _Search, goal: float, cap: float) -> _Trial:
+def _calibrate(
+    block: _Paths,
+    start: NDArray,
+    drift: NDArray,
+    step: float,
+    search: _Search,
+    goal: float,
+    cap: float,
+) -> _Trial:
     """Prices, weight and step width on a sample of the bodies."""
     if goal == math.inf:
-        return _cheapest(x, ahead, start, drift, step, search)
+        return _cheapest(block, start, drift, step, search)
     for attempt in range(TRIALS):
-        trial = _try(x, ahead, start, drift, step, search)
+        trial = _try(block, start, drift, step, search)
         search = _repriced(trial)
         ratio = goal / trial.rmse if trial.rmse > 0.0 else 2.0
         if attempt >= 3 and abs(ratio - 1.0) < 0.01:
@@ -248,7 +323,9 @@ def _calibrate(x, ahead, start, drift, step, search: _Search, goal: float, cap: 
     return replace(trial, search=search, layout=replace(trial.layout, step=step))
 
 
-def _cheapest(x, ahead, start, drift, step, search: _Search) -> _Trial:
+def _cheapest(
+    block: _Paths, start: NDArray, drift: NDArray, step: float, search: _Search
+) -> _Trial:
     """For a pointwise bound alone: the step width that takes the fewest bits on a sample.
 
     The widest leaves one level within reach of a value, narrower ones leave two to choose from.
@@ -258,53 +335,60 @@ def _cheapest(x, ahead, start, drift, step, search: _Search) -> _Trial:
         # The error does not count as long as it keeps to the bound.
         chosen = replace(search, weight=100.0)
         for _ in range(3):
-            trial = _try(x, ahead, start, drift, share * step * (1.0 - 1e-9), chosen)
+            trial = _try(block, start, drift, share * step * (1.0 - 1e-9), chosen)
             chosen = replace(_repriced(trial), weight=100.0)
-        bits = _price_of(trial.residuals, chosen.prices)
+        bits = float(np.sum(trial.counts * chosen.prices))
         if bits < fewest:
             found, fewest = replace(trial, search=chosen), bits
     return found
 
 
-def _meet(values, x, ahead, start, drift, trial: _Trial, target: Target, cap) -> bytes | None:
+def _meet(
+    block: _Paths, start: NDArray, drift: NDArray, trial: _Trial, target: Target, cap: float
+) -> tuple[bytes, NDArray] | None:
     """Paths of all bodies at the widest step whose measured error keeps to the target."""
+    values, effort = block.given, block.effort
     best, step, lowest, highest = None, trial.layout.step, 0.0, math.inf
+    if target.frobenius < math.inf:
+        step *= effort.aim
     search = trial.search
     for _ in range(TRIALS):
-        trial = _try(x, ahead, start, drift, step, search)
-        residuals = np.ascontiguousarray(trial.residuals.transpose(2, 1, 0))
-        decoded = _reconstruct(trial.layout, residuals, ahead, len(values)).astype(values.dtype)
+        trial = _try(block, start, drift, step, search)
+        decoded = _reconstruct(trial.layout, trial.residuals, block.ahead, len(values))
+        decoded = decoded.astype(values.dtype, copy=False)
         squares, maximum = kernels.deviation(values, decoded, trial.layout.step)
         frobenius = math.sqrt(squares) * trial.layout.step
         # What is measured elsewhere may be summed in another order.
         if frobenius <= (1.0 - 1e-12) * target.frobenius and maximum <= target.maximum:
-            best, lowest = (trial.layout, residuals), step
-            if frobenius >= USED * target.frobenius or target.frobenius == math.inf:
+            best, lowest = (trial, decoded), step
+            if frobenius >= effort.enough * target.frobenius or target.frobenius == math.inf:
                 break
         else:
             highest = step
         ratio = target.frobenius / frobenius if frobenius > 0.0 else 2.0
         if maximum > target.maximum:
             ratio = min(ratio, 0.9)
-        step = min(step * min(max(0.996 * ratio, 0.5), 2.0), cap)
+        step = min(step * min(max(effort.aim * ratio, 0.5), 2.0), cap)
         if not lowest < step < highest:
             step = 0.5 * (lowest + highest) if highest < math.inf else lowest
-        if step <= lowest * (1.0 + 1e-3):
+        # Widths have nine binary digits.
+        if min(step, highest) <= lowest * (1.0 + 2.0**-8):
             break
     if best is None:
         return None
-    return _write(values.dtype, *best)
+    trial, decoded = best
+    return _write(values.dtype, trial.layout, trial.residuals), decoded
 
 
 def _find_drift(x: NDArray) -> NDArray:
     """The increment per step (w,) that most values share, found component by component."""
-    bodies, width, steps = x.shape
+    steps, bodies, width = x.shape
     if steps < 4:
         return np.zeros(width)
-    moved = np.diff(x[:: max(1, bodies // 512)], axis=2)
+    moved = np.diff(x[:, :: max(1, bodies // 512)], axis=0)
     drift = np.empty(width)
     for c in range(width):
-        increments = np.sort(moved[:, c].ravel())
+        increments = np.sort(moved[:, :, c].ravel())
         run = min(max(4, len(increments) // 20), len(increments))
         first = int(np.argmin(increments[run - 1 :] - increments[: len(increments) - run + 1]))
         drift[c] = increments[first + run // 2]
@@ -325,15 +409,9 @@ def _prices_of(counts: NDArray) -> NDArray:
     return -np.log2(weights / weights.sum(axis=2, keepdims=True))
 
 
-def _counted(residuals: NDArray) -> NDArray:
-    counts = np.zeros((residuals.shape[1], kernels.LEVELS + 1, 2 * kernels.SPAN + 1))
-    kernels.count_residuals(residuals, counts)
-    return counts
-
-
 def _repriced(trial: _Trial) -> _Search:
     """The same search with prices, and the weight of a bit, as counted in a trial."""
-    counts = _counted(trial.residuals)
+    counts = trial.counts
     ends, steps = trial.layout.ends, trial.layout.shape[0]
     kinds = np.array(
         [np.sum(ends == 0), np.sum((ends > 0) & (ends < steps)), np.sum(ends == steps)]
@@ -347,11 +425,6 @@ def _repriced(trial: _Trial) -> _Search:
 
 
 WEIGHT_STILL = 0.15
-
-
-def _price_of(residuals: NDArray, prices: NDArray) -> float:
-    """Bits of residuals, about."""
-    return float(np.sum(_counted(residuals) * prices))
 
 
 # ---- layout
@@ -388,7 +461,7 @@ def _write(dtype, layout: Layout, residuals: NDArray) -> bytes:
         writer.number(1)
         writer.append(encode_integers(layout.ends))
     symbols = np.empty(residuals.size, np.int32)
-    largest = np.abs(residuals).max()
+    largest = int(kernels.largest(residuals))
     kernels.fold(np.array([largest]), np.zeros(1, np.int64), symbols[:1], np.empty(1, np.int64))
     top = (int(symbols[0]) + 1) // 2
     writer.number(top)
@@ -453,7 +526,8 @@ class _Tables:
         laws += [scale] * (CONTEXTS - kernels.LEVELS)
         self._prior = np.array([self._law(edges, scale_value(law)) for law in laws])
         self._counts = np.zeros((min(width, COMPONENTS), *self._prior.shape))
-        self._seen = np.zeros(self._counts.shape[:2], np.int64)
+        self._weights = self._prior + self._counts
+        self._seen = [[0] * len(laws) for _ in self._counts]
 
     @staticmethod
     def _law(edges: NDArray, s: float) -> NDArray:
@@ -463,18 +537,22 @@ class _Tables:
         weights *= PRIOR_WEIGHT / max(float(np.add.accumulate(weights)[-1]), 1e-300)
         return weights + 1e-3 / len(weights)
 
-    def runs(self, component: int, level: int, count: int):
-        """Yield (begin, end, weights) of runs coded with one table each; send their symbols."""
+    def run(self, component: int, level: int, most: int) -> tuple[int, NDArray]:
+        """How many symbols, at most `most`, come next with one table, and the table."""
         component = min(component, COMPONENTS - 1)
-        counts = self._counts[component, level]
-        begin = 0
-        while begin < count:
-            seen = int(self._seen[component, level])
-            end = min(count, begin + max(64, seen // 2))
-            symbols = yield begin, end, self._prior[level] + counts
-            counts += np.bincount(symbols, minlength=len(counts))
-            self._seen[component, level] += end - begin
-            begin = end
+        length = max(64, self._seen[component][level] // 2)
+        return min(length, most), self._weights[component, level]
+
+    def learn(self, component: int, level: int, symbols: NDArray) -> None:
+        """Let the table follow a run of symbols (m,) int32."""
+        component = min(component, COMPONENTS - 1)
+        kernels.count_symbols(
+            symbols,
+            self._prior[level],
+            self._counts[component, level],
+            self._weights[component, level],
+        )
+        self._seen[component][level] += len(symbols)
 
 
 def _groups(levels: NDArray):
@@ -492,24 +570,26 @@ def _encode_residuals(writer: Writer, residuals: NDArray, tables: _Tables) -> No
     """Range code residuals (T, w, n) int64, one step and component after the other."""
     _, width, bodies = residuals.shape
     last, memory = np.zeros((2, width, bodies), np.int64)
-    levels = np.empty(bodies, np.uint8)
+    levels, counts = np.empty(bodies, np.uint8), np.empty(CONTEXTS, np.int64)
     symbols, widths = np.empty(bodies, np.int32), np.empty(bodies, np.int64)
     for t, now in enumerate(residuals):
         for c in range(width):
             kernels.levels_now(now, last, memory, c, t == 0, levels)
-            kernels.fold(now[c], last[c], symbols, widths)
-            for level, indices in _groups(levels):
-                chosen = symbols[indices]
-                runs = tables.runs(c, level, len(chosen))
-                run = next(runs, None)
-                while run:
-                    begin, end, weights = run
-                    writer.symbols(chosen[begin:end], weights)
-                    run = _send(runs, chosen[begin:end])
-            for bits in range(1, int(widths.max()) + 1):
-                open_bits = np.abs(now[c][widths == bits]) & ((1 << bits) - 1)
+            widest = kernels.arrange(now, last, levels, c, symbols, widths, counts)
+            first = 0
+            for level, count in enumerate(counts.tolist()):
+                if count:
+                    chosen = symbols[first : first + count]
+                    first += count
+                    while len(chosen):
+                        length, weights = tables.run(c, level, len(chosen))
+                        writer.symbols(chosen[:length], weights)
+                        tables.learn(c, level, chosen[:length])
+                        chosen = chosen[length:]
+            for bits in range(1, widest + 1):
+                open_bits = kernels.low_bits(now[c], widths, bits)
                 if len(open_bits):
-                    writer.bits(open_bits.astype(np.uint64), bits)
+                    writer.bits(open_bits, bits)
         kernels.remember(now, t == 0, last, memory)
 
 
@@ -525,14 +605,12 @@ def _decode_residuals(reader, shape, upto: int, top: int, scale: int) -> NDArray
         for c in range(width):
             kernels.levels_now(now, last, memory, c, t == 0, levels)
             for level, indices in _groups(levels):
-                chosen = np.empty(len(indices), np.int32)
-                runs = tables.runs(c, level, len(chosen))
-                run = next(runs, None)
-                while run:
-                    begin, end, weights = run
-                    chosen[begin:end] = reader.symbols(end - begin, weights)
-                    run = _send(runs, chosen[begin:end])
-                symbols[indices] = chosen
+                while len(indices):
+                    length, weights = tables.run(c, level, len(indices))
+                    chosen = reader.symbols(length, weights)
+                    tables.learn(c, level, chosen)
+                    symbols[indices[:length]] = chosen
+                    indices = indices[length:]
             bucket = (symbols + 1) // 2
             if int(bucket.max()) >= kernels.DIRECT:
                 widths = np.maximum((bucket - kernels.DIRECT) // kernels.PARTS + 1, 0)
@@ -543,14 +621,6 @@ def _decode_residuals(reader, shape, upto: int, top: int, scale: int) -> NDArray
             kernels.unfold(symbols, low, last[c], now[c])
         kernels.remember(now, t == 0, last, memory)
     return residuals
-
-
-def _send(runs, symbols):
-    """The next run after these symbols, None after the last."""
-    try:
-        return runs.send(symbols)
-    except StopIteration:
-        return None
 
 
 def _reconstruct(layout: Layout, residuals: NDArray, ahead: NDArray, steps: int) -> NDArray:

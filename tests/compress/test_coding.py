@@ -151,13 +151,13 @@ def test_blocks_share_the_error_of_a_chunk_by_their_entries():
 def counted(monkeypatch) -> list[str]:
     """Names of coders as they are asked."""
     asked: list[str] = []
-    encode_by = coders.encode
+    encode_by = coders.encode_and_decode
 
     def encode_and_count(name, *arguments):
         asked.append(name)
         return encode_by(name, *arguments)
 
-    monkeypatch.setattr(coders, "encode", encode_and_count)
+    monkeypatch.setattr(coders, "encode_and_decode", encode_and_count)
     return asked
 
 
