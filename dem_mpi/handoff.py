@@ -49,6 +49,7 @@ LEAST_GAP = 1e-2  # that `auto` leaves between bodies
 SMALLEST_GAP = 1e-3  # that there is a solution for
 _SMALLEST_FACTOR = 0.1  # bodies that overlap so deeply are no bodies of a packing
 _FACTOR_ERROR = 1e-9  # of a factor found by bisection
+_ROUND_OFF = 1e-9  # of a gap between places that are numbers
 _RATIO_DIGITS = 12  # bodies whose aspect ratios agree so far have one curve
 _SMOOTHING = 0.2  # of the curvature where caps of rods begin, in radii
 
@@ -410,7 +411,7 @@ def shrinkage(bodies: FrameBodies, factor: float | None = None) -> Shrinkage:
     pairs = _near_pairs(bodies)
     if factor is not None:
         found = _least(bodies, pairs, factor)
-        if found.gap < SMALLEST_GAP:
+        if found.gap < (1.0 - _ROUND_OFF) * SMALLEST_GAP:
             near = f"are {found.gap:.2g} radii apart" if found.gap > 0.0 else "touch or overlap"
             raise InputError(
                 f"--hydrodynamic-radius {factor:g}: bodies {found.pair[0]} and {found.pair[1]} "

@@ -25,6 +25,7 @@ from stokes.suspension_table import BodyTable, quaternions_to
 
 # Gap, over the sum of bounding radii, from which on a neighbour changes neither axes nor grids.
 _REACH = 1.0
+_ROUND_OFF = 1e-9  # of a gap
 _CLOSE = 0.1  # gap of pairs whose near field takes memory
 
 
@@ -121,7 +122,8 @@ class _ClosePairs:
 
     def check(self, table: BodyTable, least: float) -> None:
         """ValueError that names the closest bodies, if they are closer than allowed."""
-        if not np.any(self.relative < least):
+        # Places as numbers hold a gap to round-off only: one that equals the least is allowed.
+        if not np.any(self.relative < (1.0 - _ROUND_OFF) * least):
             return
         worst = int(np.argmin(self.relative))
         i, j = np.sort(self.pair[worst]).tolist()

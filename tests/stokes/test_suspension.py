@@ -349,6 +349,14 @@ def test_overlapping_bodies_are_refused_with_their_numbers_and_gap():
         Suspension(bodies)
 
 
+@pytest.mark.parametrize("far", [0.0, 100.0])
+def test_the_least_gap_itself_is_allowed(far):
+    # Neither 2.001 nor 102.001 is a number of the machine: the gap is 1e-3 to round-off only.
+    bodies = [Body(sphere(), 1.0, (0.0, 0.0, far + z)) for z in (0.0, 2.001)]
+    solution = Suspension(bodies, tolerance=1e-4).solve(force=(0.0, 0.0, -1.0))
+    assert solution.converged
+
+
 def test_gaps_below_the_least_are_refused():
     with pytest.raises(ValueError, match=r"bodies 0 and 1.*too close: their gap is 0\.0005"):
         pair(5e-4)
