@@ -144,22 +144,31 @@ def flight_ends(x, drift, ends, share):
 
 @jit
 def flights(x, drift, ends):
-    """How many steps of each body follow the drift, 0 for bodies that soon leave it.
+    """How many steps of each body follow the drift, by what most of its steps do.
 
-    As `flight_ends` finds them. x : (T, n, w); ends : (n,) int64 out
+    All where most steps behind the first departure follow it again, none where departure is soon.
+    x : (T, n, w); ends : (n,) int64 out
     """
     steps, bodies, width = x.shape
     largest = 0.0
     for c in range(width):
         largest = max(largest, abs(drift[c]))
-    for i in range(bodies):
-        ends[i] = steps
+    again = np.zeros(bodies, np.int64)
+    ends[:] = steps
     for t in range(1, steps):
         for i in range(bodies):
-            if ends[i] == steps:
-                for c in range(width):
-                    if abs(x[t, i, c] - x[t - 1, i, c] - drift[c]) > 0.5 * largest:
-                        ends[i] = t if t > 2 else 0
+            far = False
+            for c in range(width):
+                far = far or abs(x[t, i, c] - x[t - 1, i, c] - drift[c]) > 0.5 * largest
+            if far:
+                ends[i] = min(ends[i], t)
+            elif ends[i] < steps:
+                again[i] += 1
+    for i in range(bodies):
+        if 2 * again[i] > steps - ends[i]:
+            ends[i] = steps
+        elif ends[i] < 3:
+            ends[i] = 0
 
 
 @jit
@@ -239,7 +248,8 @@ def greedy_paths(x, guide, start, drift, step, weight, prices, maximum, ends, r,
     `count_residuals` too.
 
     x, guide : (T, n, w), guide (T, 0, w) for none; ends : (n,) steps that follow the drift;
-    r : (T, w, n) int64 out; sums : (5, 3) out; counts : (w, LEVELS + 1, 2 SPAN + 1) out
+    r : (T, w, n) int64 out; sums : (5, 3) out; counts : (w, LEVELS + 1, 2 SPAN + 1) out,
+    (0, ...) for none
     """
     steps, bodies, width = x.shape
     inverse = 1.0 / step
@@ -255,15 +265,14 @@ def greedy_paths(x, guide, start, drift, step, weight, prices, maximum, ends, r,
                     activity += 4 * min(abs(r[t - 1, c, i]), CAP)
             for c in range(width):
                 last = r[t - 1, c, i] if t > 1 else 0
-                level = LEVELS
-                if t > 0:
-                    level = level_of(activity + memory[i, c] + 4 * min(abs(last), CAP))
+                expected = activity + memory[i, c] + 4 * min(abs(last), CAP)
                 off = (x[t, i, c] - _offset(guide, start, drift, ends, t, i, c)) * inverse - q[i, c]
                 value = 0
                 if t == 0 or abs(off) >= 1.0:
                     value = int(np.floor(off + 0.5))
                 elif abs(off) > 0.5:
                     move = 1 if off > 0.0 else -1
+                    level = level_of(expected)
                     gain = 2.0 * abs(off) - 1.0
                     price = _price(prices[c], level, move, last) - prices[c, level, SPAN]
                     if abs(off) * step > maximum:
@@ -292,8 +301,10 @@ def greedy_paths(x, guide, start, drift, step, weight, prices, maximum, ends, r,
                 size = min(abs(value), CAP)
                 activity += 8 * size
                 memory[i, c] = (memory[i, c] >> 1) + 4 * size if t > 0 else size
-                folded = -value if last < 0 else value
-                counts[c, level, min(max(folded, -SPAN), SPAN) + SPAN] += 1.0
+                if len(counts):
+                    level = level_of(expected) if t > 0 else LEVELS
+                    folded = -value if last < 0 else value
+                    counts[c, level, min(max(folded, -SPAN), SPAN) + SPAN] += 1.0
     for i in range(bodies):
         for c in range(width):
             last = r[steps - 1, c, i] if steps > 1 else 0
@@ -533,21 +544,6 @@ def reconstruct(guide, start, drift, step, table, ends, r, steps, out):
                 signs = 3 * ((before > 0) - (before < 0)) + (after > 0) - (after < 0) + 4
                 offset = _offset(guide, start, drift, ends, t, i, c)
                 out[t, i, c] = offset + step * (q[c, i] + shift[signs])
-
-
-@jit
-def largest(values):
-    """The largest magnitude in an array (T, n, w), NaN if there is one."""
-    found = 0.0
-    for t in range(values.shape[0]):
-        for i in range(values.shape[1]):
-            for c in range(values.shape[2]):
-                size = abs(np.float64(values[t, i, c]))
-                if not size <= found:
-                    if np.isnan(size):
-                        return size
-                    found = size
-    return found
 
 
 @jit

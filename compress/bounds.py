@@ -12,6 +12,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from compress import _kernels_bounds as kernels
+
 Kind = Literal["relative", "rmse", "pointwise", "exact"]
 KINDS: tuple[Kind, ...] = ("relative", "rmse", "pointwise", "exact")
 
@@ -128,26 +130,45 @@ class Errors:
 
 
 def measure(values: NDArray, decoded: NDArray) -> Errors:
-    """The errors of `decoded` against `values`, arrays of one shape."""
+    """The errors of `decoded` against `values`, arrays of one shape without NaN or infinity."""
     if not values.size:
         return Errors()
-    difference = np.subtract(values, decoded, dtype=np.float64)
+    x, y = _flat(values), _flat(decoded)
+    maximum, size, least, most = kernels.extremes(x, y)
+    error_scale, scale = _scale(maximum), _scale(size)
+    errors, squares = kernels.squares(x, y, error_scale, scale)
     return Errors(
         count=values.size,
-        frobenius=norm(difference),
-        norm=norm(values),
-        maximum=float(np.abs(difference).max()),
-        least=float(values.min()),
-        most=float(values.max()),
+        frobenius=math.sqrt(errors) / error_scale,
+        norm=math.sqrt(squares) / scale,
+        maximum=maximum,
+        least=least,
+        most=most,
     )
 
 
 def norm(values: NDArray) -> float:
     """||X||_F, without overflow or underflow of the squares."""
-    largest = float(np.abs(values).max(initial=0.0))
-    if largest == 0.0 or not math.isfinite(largest):
-        return largest
-    # A power of two: it changes no digit.
-    scale = math.ldexp(1.0, min(-math.frexp(largest)[1], 1000))
-    scaled = np.multiply(values, scale, dtype=np.float64).ravel()
-    return math.sqrt(float(scaled @ scaled)) / scale
+    size = largest(values)
+    if size == 0.0 or not math.isfinite(size):
+        return size
+    scale = _scale(size)
+    return math.sqrt(kernels.sum_of_squares(_flat(values), scale)) / scale
+
+
+def largest(values: NDArray) -> float:
+    """The largest magnitude of any entry, NaN if one is NaN, 0 of no entries."""
+    return kernels.largest(_flat(values))
+
+
+def _flat(values: NDArray) -> NDArray:
+    """The entries in a row, float32 or float64."""
+    plain = values.dtype in (np.float32, np.float64) and values.dtype.isnative
+    return np.ascontiguousarray(values if plain else values.astype(np.float64)).ravel()
+
+
+def _scale(size: float) -> float:
+    """A power of two, which changes no digit, that brings this magnitude to about 1."""
+    if size == 0.0 or not math.isfinite(size):
+        return 1.0
+    return math.ldexp(1.0, min(-math.frexp(size)[1], 1000))

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from compress import _kernels_predictive as kernels
-from compress.bounds import Target
+from compress.bounds import Target, largest
 from compress.effort import BEST, Effort
 from compress.entropy import (
     LAST_BUCKET,
@@ -119,7 +119,7 @@ def encode_and_decode(
         values = values.astype(np.float64, copy=False)
     if target.exact:
         raise ValueError("predictive coding loses digits: the target must allow an error")
-    if not math.isfinite(kernels.largest(values)):
+    if not math.isfinite(largest(values)):
         where = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
         raise ValueError(f"value at (step, body, component) = {where} is not finite")
     if not values.size:
@@ -197,11 +197,11 @@ def _encode_paths(
     values : (T, n, w); ahead : (T, n, w), or (T, 0, w)
     """
     _, bodies, width = values.shape
-    largest = kernels.largest(values)
+    size = largest(values)
     goal = target.rmse(values.size)
-    cap = min(2.0 * target.maximum, 8.0 * largest if largest > 0.0 else math.inf)
+    cap = min(2.0 * target.maximum, 8.0 * size if size > 0.0 else math.inf)
     step = min(math.sqrt(12.0) * goal, cap if math.isfinite(cap) else 1.0)
-    if not 1e-303 < step < 1e304 or largest > LARGEST_PATH * step:
+    if not 1e-303 < step < 1e304 or size > LARGEST_PATH * step:
         return None
     stride = max(1, bodies // effort.sample)
     near = _Paths.of(values[:, ::stride], ahead[:, ::stride], effort)
@@ -259,8 +259,16 @@ class _Trial:
     search: _Search
 
 
-def _try(block: _Paths, start: NDArray, drift: NDArray, step: float, search: _Search) -> _Trial:
-    """Choose the paths at one step width. start, drift : (w,)."""
+def _try(
+    block: _Paths,
+    start: NDArray,
+    drift: NDArray,
+    step: float,
+    search: _Search,
+    *,
+    count: bool = True,
+) -> _Trial:
+    """Choose the paths at one step width. start, drift : (w,); count: whether for new prices."""
     steps, bodies, width = block.values.shape
     step = _rounded_step(step)
     unit_start, unit_drift = _units(step, steps)
@@ -269,7 +277,7 @@ def _try(block: _Paths, start: NDArray, drift: NDArray, step: float, search: _Se
     # Where it does not leave the level, it is no drift.
     drift = np.where(np.abs(drift) * steps > 0.5 * step, drift, 0.0)
     ends, sums = np.zeros(bodies, np.int64), np.zeros((5, 3))
-    counts = np.zeros((width, kernels.LEVELS + 1, 2 * kernels.SPAN + 1))
+    counts = np.zeros((width if count else 0, kernels.LEVELS + 1, 2 * kernels.SPAN + 1))
     if block.along is None:
         if drift.any():
             kernels.flights(block.values, drift, ends)
@@ -289,7 +297,8 @@ def _try(block: _Paths, start: NDArray, drift: NDArray, step: float, search: _Se
             search.maximum, ends, share, paths,
         )  # fmt: skip
         kernels.centroid_sums(x, ahead, start, drift, step, ends, paths, sums)
-        kernels.count_residuals(paths, counts)
+        if count:
+            kernels.count_residuals(paths, counts)
         residuals = np.ascontiguousarray(paths.transpose(2, 1, 0))
     means = sums[:, 1] / np.maximum(sums[:, 0], 1.0)
     shifts = np.zeros(5)
@@ -334,7 +343,7 @@ def _cheapest(
     for share in (1.0, 0.75, 0.5):
         # The error does not count as long as it keeps to the bound.
         chosen = replace(search, weight=100.0)
-        for _ in range(3):
+        for _ in range(3 if block.effort.thorough else 2):
             trial = _try(block, start, drift, share * step * (1.0 - 1e-9), chosen)
             chosen = replace(_repriced(trial), weight=100.0)
         bits = float(np.sum(trial.counts * chosen.prices))
@@ -353,7 +362,7 @@ def _meet(
         step *= effort.aim
     search = trial.search
     for _ in range(TRIALS):
-        trial = _try(block, start, drift, step, search)
+        trial = _try(block, start, drift, step, search, count=False)
         decoded = _reconstruct(trial.layout, trial.residuals, block.ahead, len(values))
         decoded = decoded.astype(values.dtype, copy=False)
         squares, maximum = kernels.deviation(values, decoded, trial.layout.step)
@@ -403,7 +412,7 @@ def _first_prices(width: int) -> NDArray:
 def _prices_of(counts: NDArray) -> NDArray:
     sizes = np.abs(np.arange(-kernels.SPAN, kernels.SPAN + 1))
     means = [*_prior_means(kernels.LEVELS), 3.0]
-    prior = np.array([half_power(sizes / _laplace_scale(mean)) for mean in means])
+    prior = half_power(sizes / np.array([[_laplace_scale(mean)] for mean in means]))
     prior = prior / prior.sum(axis=1, keepdims=True) + 1e-5
     weights = counts + PRIOR_WEIGHT * prior
     return -np.log2(weights / weights.sum(axis=2, keepdims=True))
@@ -461,8 +470,8 @@ def _write(dtype, layout: Layout, residuals: NDArray) -> bytes:
         writer.number(1)
         writer.append(encode_integers(layout.ends))
     symbols = np.empty(residuals.size, np.int32)
-    largest = int(kernels.largest(residuals))
-    kernels.fold(np.array([largest]), np.zeros(1, np.int64), symbols[:1], np.empty(1, np.int64))
+    widest = max(int(residuals.max()), -int(residuals.min()))
+    kernels.fold(np.array([widest]), np.zeros(1, np.int64), symbols[:1], np.empty(1, np.int64))
     top = (int(symbols[0]) + 1) // 2
     writer.number(top)
     scale = nearest_scale(_laplace_scale(float(np.abs(residuals[0]).mean())))
@@ -524,18 +533,20 @@ class _Tables:
         edges = bucket_edges(top + 2)
         laws = [nearest_scale(_laplace_scale(mean)) for mean in _prior_means(kernels.LEVELS)]
         laws += [scale] * (CONTEXTS - kernels.LEVELS)
-        self._prior = np.array([self._law(edges, scale_value(law)) for law in laws])
+        self._prior = self._laws(edges, np.array([[scale_value(law)] for law in laws]))
         self._counts = np.zeros((min(width, COMPONENTS), *self._prior.shape))
         self._weights = self._prior + self._counts
         self._seen = [[0] * len(laws) for _ in self._counts]
 
     @staticmethod
-    def _law(edges: NDArray, s: float) -> NDArray:
+    def _laws(edges: NDArray, s: NDArray) -> NDArray:
+        """Weights (laws, symbols) of distributions with the scales s (laws, 1)."""
         below = half_power(edges / s)
-        weights = below[:-1] * (1.0 - half_power(np.diff(edges) / s))
-        weights = np.concatenate([0.5 * weights[:1], np.repeat(0.5 * weights[1:], 2)])
-        weights *= PRIOR_WEIGHT / max(float(np.add.accumulate(weights)[-1]), 1e-300)
-        return weights + 1e-3 / len(weights)
+        weights = 0.5 * (below[:, :-1] * (1.0 - half_power(np.diff(edges) / s)))
+        weights = np.concatenate([weights[:, :1], np.repeat(weights[:, 1:], 2, axis=1)], axis=1)
+        # In the order of the symbols, on which the last bit depends.
+        total = np.add.accumulate(weights, axis=1)[:, -1:]
+        return weights * (PRIOR_WEIGHT / np.maximum(total, 1e-300)) + 1e-3 / weights.shape[1]
 
     def run(self, component: int, level: int, most: int) -> tuple[int, NDArray]:
         """How many symbols, at most `most`, come next with one table, and the table."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from compress.archive import ArchiveWriter
 from compress.bounds import Bound, Target, measure, norm
 from compress.coding import Block, Encoder, FieldSpec, Memory, Scale, Settings, Winner, held
 
-from moving_bodies import FIELDS, SETTINGS, chunk_of
+from moving_bodies import FIELDS, SETTINGS, chunk_of, falling_bodies
 
 TIMES = np.arange(16) * 1e-3
 
@@ -229,3 +230,50 @@ def test_blocks_that_contradict_themselves_are_refused(change):
     block = Block(np.arange(3), {"x": np.zeros((16, 3, 3))})
     with pytest.raises(ValueError):
         encoder_of(Bound("exact")).encode(replace(block, **change), TIMES)
+
+
+@pytest.mark.parametrize("bound", [Bound("relative", 1e-2), Bound("pointwise", 1e-4)])
+def test_fast_effort_keeps_bounds_for_a_few_more_bytes(bound):
+    position, velocity, times = falling_bodies(bodies=2000)
+    for values in (position, velocity):
+        coded = {}
+        for effort in ("best", "fast"):
+            encoder = Encoder({"x": FieldSpec(bound, width=3)}, Settings(effort=effort))
+            coded[effort] = encoder.encode(Block(np.arange(2000), {"x": values}), times).fields["x"]
+            decoded = decode(coded[effort], values)
+            assert coded[effort].errors == measure(values, decoded)
+            assert bound.target(values).met_by(coded[effort].errors)
+        assert len(coded["fast"].data) <= 1.15 * len(coded["best"].data) + 64
+
+
+def test_errors_of_fast_effort_are_measured_without_decoding(monkeypatch):
+    """On what the decoder gives all the same: the encoder knows that to the last bit."""
+    encoder = encoder_of(Bound("relative", 1e-2), effort="fast", trial_every=1000)
+    rough = np.cumsum(np.random.default_rng(6).standard_normal((16, 300, 3)), axis=0)
+    encode(encoder, rough)
+    assert encoder.memory.winners["x"].coder == "predictive"
+    with monkeypatch.context() as patched:
+        patched.setattr(coders, "decode", None)
+        part = encode(encoder, rough[::-1].copy()).fields["x"]
+    assert part.errors == measure(rough[::-1], decode(part, rough))
+
+
+def test_unknown_effort_is_refused():
+    with pytest.raises(ValueError, match="effort 'slow': must be one of best, fast"):
+        Settings(effort="slow")
+
+
+@pytest.mark.parametrize("effort", ["best", "fast"])
+def test_resumed_archive_has_the_bytes_of_one_never_interrupted(tmp_path, effort):
+    """What is carried from chunk to chunk is in the file, and depends on no clock."""
+    quick = replace(SETTINGS, effort=effort, trial_every=2)
+    paths = tmp_path / "whole.tta", tmp_path / "resumed.tta"
+    for path, ends in zip(paths, [(4,), (1, 3, 4)], strict=True):
+        writer = ArchiveWriter(path, FIELDS, settings=quick)
+        for begin, end in itertools.pairwise((0, *ends)):
+            for number in range(begin, end):
+                writer.append(chunk_of(number))
+            writer.abandon()
+            writer = ArchiveWriter.resume(path)
+        writer.close()
+    assert paths[0].read_bytes() == paths[1].read_bytes()
