@@ -513,7 +513,7 @@ def compress(
         typer.Option(
             "--tol",
             help="Relative error in each chunk, Frobenius norm, of fields without a bound of their "
-            "own; what bodies keep for life (radius, shape, ...) is kept exactly.",
+            "own; what bodies keep for life (as radius and shape) is kept exactly.",
         ),
     ] = 1e-2,
     field: Annotated[
@@ -555,7 +555,7 @@ def compress(
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace ARCHIVE if it exists.")] = False,
 ) -> None:
-    """Compress a trajectory or an array: mpirun -n P dem-mpi compress SOURCE.
+    """Compress a run or an array: mpirun -n P dem-mpi compress SOURCE.
 
     The error of what the archive holds is measured while it is written, and kept in it; dem-mpi
     info tells it. A signal ends the program behind a chunk with 75; --resume goes on from there.
@@ -633,7 +633,10 @@ def compare(
     second: Annotated[str, typer.Argument(help="What is compared with it.", metavar="B")],
     fields: Fields = None,
 ) -> None:
-    """Say how far B is from A: errors of each field, at steps and of bodies that both have."""
+    """Say how far B is from A: errors of each field.
+
+    At steps, and of bodies, that both have.
+    """
     from dem_mpi.compress_options import parse_selection
 
     selection = parse_selection(fields, None, None)

@@ -50,7 +50,10 @@ def finished(tmp_path_factory) -> Path:
 # ---- help and usage ---------------------------------------------------------------------------
 
 VERBS = {
-    "": ("--version", "run", "check", "schema", "info", "solve", "flow", "warmup"),
+    "": (
+        "--version", "run", "check", "schema", "info", "solve", "flow", "compress", "restore",
+        "slice", "compare", "warmup",
+    ),
     "run": ("SCENE", "--resume", "--out DIR", "--set KEY.PATH=VALUE", "--force"),
     "check": ("SCENE", "--set KEY.PATH=VALUE", "--ranks"),
     "schema": (),
@@ -65,6 +68,13 @@ VERBS = {
         "--formulation", "--max-iterations", "--grid NX,NY,NZ", "--points", "--output FLOW.h5",
         "--force", "--render", "--slice", "--dry-run", "--threads",
     ),
+    "compress": (
+        "SOURCE", "--tol", "--field NAME[=BOUND]", "--chunk", "--floor", "--explain",
+        "--output ARCHIVE", "--resume", "--force",
+    ),
+    "restore": ("ARCHIVE", "--fields", "--steps A:B", "--bodies A:B", "--output FILE", "--force"),
+    "slice": ("ARCHIVE", "--fields", "--steps A:B", "--bodies A:B", "--output FILE.csv", "--force"),
+    "compare": ("A", "B", "--fields"),
     "warmup": ("--threads",),
 }  # fmt: skip
 
