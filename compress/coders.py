@@ -92,7 +92,7 @@ def _encode(
     if name == "constant":
         return _encode_constant(values, target)
     if name == "tt":
-        data = tt_coder.encode(values, target)
+        data = tt_coder.encode(values, target, effort=effort)
         return data if tt_coder.pays(data) else None
     if name == "qtt":
         return _encode_tensorised(values, target, context)

@@ -50,15 +50,17 @@ def scaled_target(target: Target, exponent: int) -> Target:
 class Seeker:
     """Finds the step whose error is just below the target, from one trial to the next."""
 
-    def __init__(self, step: float) -> None:
+    def __init__(self, step: float, close: float = CLOSE) -> None:
+        """`close` : share of the target with which the search ends; it aims between this and 1."""
         self.step = step_code(step)
+        self._close, self._seek = close, 0.5 * (close + 1.0)
         self._kept, self._broken = -1, STEPS  # largest step that met the target, smallest not
         self._last: tuple[float, float] | None = None
         self._slope = 0.8  # d ln(error) / d ln(step), of the last two trials
 
     def learn(self, excess: float) -> bool:
         """Take in the error of `step` over the target and choose the next; True at the end."""
-        if CLOSE <= excess <= MET:
+        if self._close <= excess <= MET:
             return True
         if excess <= MET:
             self._kept = max(self._kept, self.step)
@@ -71,6 +73,6 @@ class Seeker:
         self._last = here
         if self._broken - self._kept <= 1:
             return True
-        wanted = step_code(math.exp(here[0] + (math.log(SEEK) - here[1]) / self._slope))
+        wanted = step_code(math.exp(here[0] + (math.log(self._seek) - here[1]) / self._slope))
         self.step = min(max(wanted, self._kept + 1), self._broken - 1)
         return False

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from compress import tt_natural, tt_tensorised
 from compress._bytes import Bytes, number
 from compress.bounds import Target, measure
+from compress.effort import BEST, Effort
 from compress.step_search import CLOSE, SEEK
 
 Form = Literal["natural", "tensorised"]
@@ -66,12 +67,14 @@ def encode(
     *,
     order: NDArray | None = None,
     form: Form = "natural",
+    effort: Effort = BEST,
 ) -> bytes:
     """Code a block so that what `decode` makes of it meets the target, as measured.
 
     values : (T, n, w) float32 or float64
     order : (n,) a permutation that puts neighbours in space side by side; only the tensorised
     form uses it, and `decode` needs the same one
+    effort : how close to the target the natural form is to come
 
     Raises ValueError for values of another type or number of dimensions, and for NaN and infinity.
     """
@@ -86,9 +89,9 @@ def encode(
     if form == "tensorised" and measure(values, 0.0 * values).frobenius > target.frobenius:
         coded = _encode_tensorised(values, target, order)
     elif steps * width > SECTION_COLUMNS and steps > 1:
-        coded = _encode_sections(values, target)
+        coded = _encode_sections(values, target, effort)
     else:
-        coded = _encode_natural(values, target)
+        coded = _encode_natural(values, target, effort)
     return raw if coded is None or len(coded) >= len(raw) else coded
 
 
@@ -152,13 +155,13 @@ def _indices(wanted: Wanted, length: int) -> NDArray:
     return every if wanted is None else every[wanted]
 
 
-def _encode_natural(values: NDArray, target: Target) -> bytes | None:
+def _encode_natural(values: NDArray, target: Target, effort: Effort) -> bytes | None:
     """A train of two cores; None if that does not pay or cannot meet the target."""
     head = Header(NATURAL, values.dtype, values.shape).pack()
     for share in (1.0, LAST_ROUNDING):
         # The search sees the values as float64 scaled by a power of two.
         goal = Target(share * target.frobenius, share * target.maximum)
-        code = tt_natural.encode(values, goal)
+        code = tt_natural.encode(values, goal, effort)
         if code is None:
             return None
         if _is_plain(values) or target.met_by(measure(values, decode(head + code))):
@@ -192,7 +195,7 @@ def _is_plain(values: NDArray) -> bool:
     return values.dtype == np.float64 and abs(exponent) < 900
 
 
-def _encode_sections(values: NDArray, target: Target) -> bytes | None:
+def _encode_sections(values: NDArray, target: Target, effort: Effort) -> bytes | None:
     """Sections of time one after another, each with its share of the target."""
     steps, _, width = values.shape
     count = -(-steps * width // SECTION_COLUMNS)
@@ -200,7 +203,7 @@ def _encode_sections(values: NDArray, target: Target) -> bytes | None:
     data = Header(SECTIONS, values.dtype, values.shape).pack() + number(len(sections))
     for part in sections:
         share = math.sqrt(len(part) / steps)
-        code = encode(part, Target(target.frobenius * share, target.maximum))
+        code = encode(part, Target(target.frobenius * share, target.maximum), effort=effort)
         data += number(len(code)) + code
     return data
 

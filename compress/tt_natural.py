@@ -24,6 +24,7 @@ from compress import _kernels_basis as basis
 from compress._bytes import Bytes, number, signed
 from compress._kernels_context import combine
 from compress.bounds import Target
+from compress.effort import BEST, Effort
 from compress.quantise import PRICE, Rounded, round_matrix, shift_values, unround
 from compress.step_search import FIRST_OCTAVE, MET, Seeker, scaled_target, step_size
 
@@ -49,7 +50,7 @@ class _Code:
         return head + bytes(shift % 256 for shift in self.body.shifts) + self.body.data
 
 
-def encode(values: NDArray, target: Target) -> bytes | None:
+def encode(values: NDArray, target: Target, effort: Effort = BEST) -> bytes | None:
     """Code (T, n, w) finite values; None if that takes more bytes or finer steps than there are.
 
     The target, not exact, is met to within the rounding of float64 arithmetic.
@@ -59,7 +60,7 @@ def encode(values: NDArray, target: Target) -> bytes | None:
     X = np.ldexp(np.asarray(values, np.float64).transpose(1, 0, 2), -exponent)
     X = np.ascontiguousarray(X).reshape(n, T * width)
     block = _Block(X, width, scaled_target(target, exponent), values.nbytes)
-    code = block.search()
+    code = block.search(effort.enough)
     return None if code is None else code.pack(exponent)
 
 
@@ -137,20 +138,20 @@ class _Block:
             "ktw,dt->kdw", rows.reshape(len(rows), -1, width), self.p, optimize=True
         ).reshape(len(rows), c)
 
-    def search(self) -> _Code | None:
-        """The code of the largest step tried whose error keeps to the target."""
+    def search(self, close: float) -> _Code | None:
+        """The code of the largest step tried whose error keeps to the target, `close` if it can."""
         if self._vanishes():
             return self._zero()
         n = len(self.X)
         step = self._first_step()
         if n >= 2 * SAMPLE:
-            trial = Seeker(step)
+            trial = Seeker(step, close)
             for _ in range(3):
                 code = self.code(trial.step, slice(None, None, n // SAMPLE))
                 if code is None or trial.learn(code.excess):
                     break
             step = step_size(trial.step)
-        trial, best = Seeker(step), None
+        trial, best = Seeker(step, close), None
         for _ in range(PASSES):
             code = self.code(trial.step)
             if code is None:
