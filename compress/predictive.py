@@ -54,6 +54,7 @@ COMPONENTS = 6  # from this one on, components share their tables
 PRIOR_WEIGHT = 12.0
 SHIFT_UNIT = 1.0 / 128.0
 TRIALS = 10
+SETTLED = 4  # trials after which the error goes up and down with where levels lie, not with D
 LARGEST_PATH = 2.0**45  # levels: their exact float64, with shifts, ends here
 
 
@@ -322,7 +323,7 @@ def _calibrate(
     """Prices, weight and step width on a sample of the bodies."""
     if goal == math.inf:
         return _cheapest(block, start, drift, step, search)
-    for attempt in range(TRIALS):
+    for attempt in range(SETTLED + 2):
         trial = _try(block, start, drift, step, search)
         search = _repriced(trial)
         ratio = goal / trial.rmse if trial.rmse > 0.0 else 2.0
@@ -361,7 +362,9 @@ def _meet(
     if target.frobenius < math.inf:
         step *= effort.aim
     search = trial.search
-    for _ in range(TRIALS):
+    for attempt in range(TRIALS):
+        if attempt >= SETTLED and best is not None:
+            break
         trial = _try(block, start, drift, step, search, count=False)
         decoded = _reconstruct(trial.layout, trial.residuals, block.ahead, len(values))
         decoded = decoded.astype(values.dtype, copy=False)
