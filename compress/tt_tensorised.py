@@ -108,7 +108,7 @@ def decode(
     component = np.tile(np.arange(width), len(steps))
     step = np.repeat(steps, width)
     digits = layout.locate(step, np.zeros_like(step), component)[:, split:]
-    mirrored = [np.ascontiguousarray(core.transpose(2, 1, 0)) for core in cores[: split - 1 : -1]]
+    mirrored = [np.ascontiguousarray(core.transpose(2, 1, 0)) for core in cores[split:][::-1]]
     right = _expand(mirrored, digits[:, ::-1])
     y = kernels.multiply(left, np.ascontiguousarray(right.T))
     y = y.reshape(len(bodies), len(steps), width).transpose(1, 0, 2)

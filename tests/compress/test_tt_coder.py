@@ -76,6 +76,12 @@ def test_error_keeps_to_the_relative_bound(
     assert len(data) <= values.nbytes + 16
 
 
+def test_one_body_is_a_train_over_time_alone():
+    values = low_rank(0, (2, 1, 2), 0, 1e-6)
+    target = Bound("relative", 0.3).target(values)
+    assert target.met_by(measure(values, decode(encode(values, target, form="tensorised"))))
+
+
 @settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
