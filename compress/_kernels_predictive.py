@@ -372,19 +372,24 @@ def levels_now(now, last, memory, component, first, out):
     out : (n,) uint8
     """
     width, bodies = now.shape
-    for i in range(bodies):
-        activity = 0
-        for d in range(component):
-            activity += 8 * min(abs(now[d, i]), CAP)
-        if first:
+    activity = np.zeros(bodies, np.int64)
+    # One row after the other: loops of this kind take several bodies at once.
+    for d in range(component):
+        row = now[d]
+        for i in range(bodies):
+            activity[i] += 8 * min(abs(row[i]), CAP)
+    if first:
+        for i in range(bodies):
             # Contexts of their own, half as many.
-            out[i] = LEVELS + level_of(activity) // 2
-            continue
-        activity += memory[component, i] + 8 * min(abs(last[component, i]), CAP)
-        for d in range(width):
-            if d != component:
-                activity += 4 * min(abs(last[d, i]), CAP)
-        out[i] = level_of(activity)
+            out[i] = LEVELS + level_of(activity[i]) // 2
+        return
+    for d in range(width):
+        row = last[d]
+        weight = 8 if d == component else 4
+        for i in range(bodies):
+            activity[i] += weight * min(abs(row[i]), CAP)
+    for i in range(bodies):
+        out[i] = level_of(activity[i] + memory[component, i])
 
 
 @jit

@@ -120,13 +120,14 @@ def encode_and_decode(
         values = values.astype(np.float64, copy=False)
     if target.exact:
         raise ValueError("predictive coding loses digits: the target must allow an error")
-    if not math.isfinite(largest(values)):
+    size = largest(values)
+    if not math.isfinite(size):
         where = tuple(np.argwhere(~np.isfinite(values))[0].tolist())
         raise ValueError(f"value at (step, body, component) = {where} is not finite")
     if not values.size:
         return _encode_raw(values), values
     ahead = _predictions(values.shape, guide, start)
-    coded = _encode_paths(values, ahead, target, effort)
+    coded = _encode_paths(values, size, ahead, target, effort)
     if coded is None or len(coded[0]) > 0.8 * values.nbytes:
         raw = _encode_raw(values)
         return (raw, values) if coded is None or len(raw) < len(coded[0]) else coded
@@ -191,14 +192,13 @@ def _predictions(shape: tuple[int, int, int], guide: NDArray | None, start: NDAr
 
 
 def _encode_paths(
-    values: NDArray, ahead: NDArray, target: Target, effort: Effort
+    values: NDArray, size: float, ahead: NDArray, target: Target, effort: Effort
 ) -> tuple[bytes, NDArray] | None:
     """The block as paths and what that decodes to, or None where they cannot meet the target.
 
-    values : (T, n, w); ahead : (T, n, w), or (T, 0, w)
+    values : (T, n, w), of magnitudes up to `size`; ahead : (T, n, w), or (T, 0, w)
     """
     _, bodies, width = values.shape
-    size = largest(values)
     goal = target.rmse(values.size)
     cap = min(2.0 * target.maximum, 8.0 * size if size > 0.0 else math.inf)
     step = min(math.sqrt(12.0) * goal, cap if math.isfinite(cap) else 1.0)
@@ -397,7 +397,7 @@ def _find_drift(x: NDArray) -> NDArray:
     steps, bodies, width = x.shape
     if steps < 4:
         return np.zeros(width)
-    moved = np.diff(x[:, :: max(1, bodies // 512)], axis=0)
+    moved = np.diff(x[:, :: max(1, bodies // 256)], axis=0)
     drift = np.empty(width)
     for c in range(width):
         increments = np.sort(moved[:, :, c].ravel())
