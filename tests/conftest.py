@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,18 @@ def _on_rank(config: pytest.Config) -> RankReporter | None:
 def pytest_configure(config: pytest.Config) -> None:
     if _on_rank(config) is None:
         config.pluginmanager.register(Dispatcher(config))
+        _give_programs_their_signals()
+
+
+def _give_programs_their_signals() -> None:
+    """Let programs that tests start take HUP and INT, though this process ignores them.
+
+    `nohup`, and `&` in a script, start a process that ignores signals, and what it starts inherits
+    that; a handler, which does nothing here, is not inherited.
+    """
+    for number in (signal.SIGHUP, signal.SIGINT):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, lambda *_: None)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
