@@ -429,7 +429,8 @@ def draw_bed(data: Path, told: Row, tau: float, path: Path) -> None:
         (f"error, {tau:g} of the whole", error, "speed of the difference [m/s]", "magma",
          error[shown].max()),
     ]  # fmt: skip
-    figure, axes = plt.subplots(1, 3, figsize=(16, 4.2), constrained_layout=True)
+    # Beds are wide: one above the other they are as large as a page allows.
+    figure, axes = plt.subplots(3, 1, figsize=(10, 7.5), sharex=True, constrained_layout=True)
     for axis, (title, values, label, colours, top) in zip(axes, panels, strict=True):
         widths = np.full(int(shown.sum()), 0.02)
         spheres = EllipseCollection(
@@ -440,8 +441,9 @@ def draw_bed(data: Path, told: Row, tau: float, path: Path) -> None:
         spheres.set_clim(0.0, top)
         axis.add_collection(spheres)
         axis.set(xlim=(x.min() - 0.02, x.max() + 0.02), ylim=(-0.51, z[shown].max() + 0.05),
-                 aspect="equal", title=title, xlabel="x [m]", ylabel="z [m]")  # fmt: skip
-        figure.colorbar(spheres, ax=axis, label=label, shrink=0.8)
+                 aspect="equal", title=title, ylabel="z [m]")  # fmt: skip
+        figure.colorbar(spheres, ax=axis, label=label)
+    axes[-1].set_xlabel("x [m]")
     figure.suptitle(f"Velocities at {told['time']:.3f} s, a slice through the middle")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
