@@ -31,8 +31,9 @@ from compress.archive import (
 )
 from compress.bounds import Bound, Errors
 from compress.coding import Memory
+from compress.effort import EFFORTS
 from dem_mpi.bodies import FIELDS
-from dem_mpi.errors import DataError, DemError
+from dem_mpi.errors import DataError, DemError, InputError
 from dem_mpi.frame_buffer import FrameBuffer, PendingFrames, Track
 from dem_mpi.h5files import agree, readable_size
 from dem_mpi.parallel import Parallel
@@ -311,7 +312,8 @@ class InSitu:
         """Go on from what a checkpoint kept, None where it knew of no archive.
 
         An archive that cannot be gone on with is kept under another name and a new one begun;
-        the text that is returned tells the user, "" where there is nothing to tell.
+        the text that is returned tells the user, "" where there is nothing to tell. OutputError
+        where it cannot be written now, as while another process writes it: it stays as it is.
         """
         fields, settings = _of_section(section, step_size)
         buffer = FrameBuffer(list(fields))
@@ -326,7 +328,7 @@ class InSitu:
                     f"{path}: ends with step {archived}, the checkpoint expects {expected}"
                 )
             message = ""
-        except DemError as error:
+        except (DataError, InputError) as error:
             archived, message = -1, _put_aside(parallel, path, error)
             writer = ChunkWriter.create(parallel, path, fields, settings, provenance)
         if pending is not None and len(pending.step):
@@ -376,7 +378,7 @@ class InSitu:
 
 
 def _of_section(section: Compress, step_size: float) -> tuple[dict[str, FieldSpec], Settings]:
-    settings = Settings(floor=section.floor, trial_every=_TRIAL_EVERY, step_size=step_size)
+    settings = Settings(section.floor, _TRIAL_EVERY, step_size, effort="fast")
     return field_specs(section.fields.bounds), settings
 
 
@@ -425,6 +427,7 @@ def _code_a_few_bodies() -> None:
     block = Block(np.arange(n), {"velocity": velocity, "position": position})
     for kind in ("relative", "pointwise"):
         bounds = {"velocity": (kind, 1e-2), "position": (kind, 1e-4)}
-        encoder = Encoder(field_specs(bounds))
-        for _ in range(2):  # a first chunk, and one with another before it
-            encoder.encode(block, times)
+        for effort in EFFORTS:
+            encoder = Encoder(field_specs(bounds), Settings(effort=effort))
+            for _ in range(2):  # a first chunk, and one with another before it
+                encoder.encode(block, times)
