@@ -167,8 +167,11 @@ class Run:
         return state, False
 
     def _refuse_to_replace(self) -> None:
-        """Collective. Raise if a run is there already, or the checkpoints of one."""
-        present = [self._path] if self._path.exists() else []
+        """Collective. Raise if a run is there already, or its archive, or checkpoints of one."""
+        outputs, section = [self._path], self._scenario.compress
+        if section is not None:
+            outputs.append(self._path.parent / section.path)
+        present = [path for path in outputs if path.exists()]
         present += self._path.parent.glob(f"{self._stem}.checkpoint.*.h5")
         first = self._parallel.broadcast(present[0] if present else None)
         if first is not None and not self._options.force:

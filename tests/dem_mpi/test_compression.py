@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from compress.archive import Archive
+from dem_mpi.errors import InputError, OutputError
+from dem_mpi.h5files import OutputLock
 from dem_mpi.trajectory_chunks import TrajectoryChunks
 
 from launch import ROOT, kill_ranks, start_ranks
@@ -116,6 +118,27 @@ def test_an_archive_that_is_missing_or_damaged_begins_anew_and_says_so(parallel,
         assert opened.steps[0] <= 8
 
 
+def test_an_archive_that_another_process_writes_is_left_alone(parallel, tmp_path):
+    simulate(parallel, PILED, tmp_path, steps=8)
+    archive = tmp_path / "run.tt.h5"
+    before = archive.read_bytes()
+    lock = OutputLock(parallel, archive)
+    with pytest.raises(OutputError, match="another run is writing it"):
+        simulate(parallel, PILED, tmp_path, resume=True)
+    lock.release()
+    assert archive.read_bytes() == before
+    assert not list(tmp_path.glob("*.damaged*"))
+    simulate(parallel, PILED, tmp_path, resume=True)
+    assert_archive_is_the_run(tmp_path)
+
+
+def test_a_run_spends_little_time_on_its_archive(parallel, tmp_path):
+    """The effort is kept in the archive: no run waits for the last per cents of size."""
+    simulate(parallel, PILED, tmp_path)
+    with Archive(tmp_path / "run.tt.h5") as archive:
+        assert archive.settings.effort == "fast"
+
+
 def test_fields_of_the_archive_need_not_be_in_the_trajectory(parallel, tmp_path):
     scene = PILED.replace("velocity: 1e-3", "velocity: 1e-3, angular_velocity: {rmse: 1e-2}")
     scene = scene.replace("fields: [position, velocity, angular_velocity, orientation, ",
@@ -124,6 +147,15 @@ def test_fields_of_the_archive_need_not_be_in_the_trajectory(parallel, tmp_path)
     with Archive(tmp_path / "run.tt.h5") as archive:
         assert archive.fields["angular_velocity"].unit == "rad/s"
         assert archive.errors("angular_velocity").rmse <= 1e-2
+
+
+def test_an_archive_without_its_run_is_not_overwritten_unasked(parallel, tmp_path):
+    (tmp_path / "run.tt.h5").write_bytes(b"precious")
+    with pytest.raises(InputError, match=r"run\.tt\.h5 exists: .*--force replaces it"):
+        simulate(parallel, PILED, tmp_path)
+    assert (tmp_path / "run.tt.h5").read_bytes() == b"precious"
+    simulate(parallel, PILED, tmp_path, force=True)
+    assert_archive_is_the_run(tmp_path)
 
 
 def test_a_killed_run_resumes_without_a_step_lost_or_doubled(tmp_path):
