@@ -189,13 +189,13 @@ class Archive:
 
     def _bodies(self, chunks: Sequence[int], wanted: slice | NDArray | None) -> NDArray:
         gid = np.zeros(0, np.int64)
-        seen: set[int] = set()
+        seen: set[tuple[int, int]] = set()
         for number in chunks:
             for place in range(len(self._records[number].blocks)):
-                table = self._table(number, place)
-                if id(table) not in seen:
-                    seen.add(id(table))
-                    gid = np.union1d(gid, _chosen(table, wanted))
+                source = self._source(number, place)
+                if source not in seen:
+                    seen.add(source)
+                    gid = np.union1d(gid, _chosen(self._table(number, place), wanted))
         return gid
 
     def _read_chunk(
@@ -285,17 +285,19 @@ class Archive:
 
     def _table(self, number: int, place: int) -> NDArray:
         """The body numbers of a block."""
-        block = self._records[number].blocks[place]
-        if not isinstance(block.gids, Piece):
-            return self._table(block.gids, place)
-        key = (number, place)
+        key = self._source(number, place)
         if key not in self._tables:
-            with self._trusting(number, "numbers of bodies"):
-                table = self._open.reader.numbers(block)
+            with self._trusting(key[0], "numbers of bodies"):
+                table = self._open.reader.numbers(self._records[key[0]].blocks[place])
             if len(self._tables) >= _TABLES:
                 del self._tables[next(iter(self._tables))]
             self._tables[key] = table
         return self._tables[key]
+
+    def _source(self, number: int, place: int) -> tuple[int, int]:
+        """The chunk that has the body numbers of a block, and the place of the block in it."""
+        gids = self._records[number].blocks[place].gids
+        return (number if isinstance(gids, Piece) else gids), place
 
     def _bytes(self, piece: Piece, number: int, what: str) -> bytes:
         with self._trusting(number, what):

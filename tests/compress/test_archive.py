@@ -199,6 +199,22 @@ def test_bodies_that_move_between_ranks_stay_one_row(tmp_path):
     assert np.array_equal(restored.fields["contacts"], expected)
 
 
+def test_bodies_of_more_chunks_than_tables_are_kept_decoded_for_are_all_there(tmp_path):
+    fields = {"x": FieldSpec(Bound("exact"))}
+    count = 200
+    values = np.random.default_rng(2).random((count, 1, 3, 1))
+    chunks = [
+        Chunk(np.array([k]), np.array([1.0 * k]), (Block(3 * k + np.arange(3), {"x": values[k]}),))
+        for k in range(count)
+    ]
+    with Archive(write(tmp_path / "a.tta", chunks, fields)) as archive:
+        assert np.array_equal(archive.gid, np.arange(3 * count))
+        restored = archive.read()
+    assert np.array_equal(restored.gid, np.arange(3 * count))
+    assert np.array_equal(restored.present, np.kron(np.eye(count), np.ones(3)) == 1.0)
+    assert np.array_equal(restored.fields["x"][restored.present], values.reshape(-1, 1))
+
+
 def test_chunks_that_hardly_change_cost_a_hundred_bytes(tmp_path):
     fields = {"velocity": FIELDS["velocity"]}
     still = np.full((32, 1000, 3), 0.25)
