@@ -172,7 +172,10 @@ class RecordWriter:
         self._gids[place] = (gid, chunk)
 
     def record(self, chunk: CodedChunk, number: int, start: int) -> tuple[bytes, bytes]:
-        """Chunk `number` as a record at `start` of `data`, and its row of the index."""
+        """Chunk `number` as a record at `start` of `data`, and its row of the index.
+
+        Nothing is remembered of it: that is for `remember`, when it is in the file.
+        """
         pieces: list[bytes] = []
         steps = np.asarray(chunk.steps, np.int64)
         times = np.asarray(chunk.times, np.float64)
@@ -180,20 +183,29 @@ class RecordWriter:
             [
                 _steps_entry(steps, pieces),
                 _times_entry(times, steps, self.header.settings, pieces),
-                [self._block_entry(b, k, number, pieces) for k, b in enumerate(chunk.blocks)],
+                [self._block_entry(b, k, pieces) for k, b in enumerate(chunk.blocks)],
             ]
         )
         body = b"".join(pieces)
         end = start + len(head) + len(body)
         return head + body, index_row(head, number, start, end)
 
-    def _block_entry(self, block: CodedBlock, place: int, number: int, pieces: list[bytes]) -> list:
+    def remember(self, chunk: CodedChunk, number: int) -> None:
+        """Know what chunk `number` has brought into the file, now that it is there."""
+        for place, block in enumerate(chunk.blocks):
+            if self._source(place, block.gid) is None:
+                self.know(place, np.asarray(block.gid, np.int64), number)
+
+    def _source(self, place: int, gid: NDArray) -> int | None:
+        """The chunk of the file whose block `place` has these numbers, None: they are new."""
         known, chunk = self._gids.get(place, (None, 0))
-        gids: Any = chunk
-        if known is None or not np.array_equal(known, block.gid):
+        return None if known is None or not np.array_equal(known, gid) else chunk
+
+    def _block_entry(self, block: CodedBlock, place: int, pieces: list[bytes]) -> list:
+        gids: Any = self._source(place, block.gid)
+        if gids is None:
             gid = np.asarray(block.gid, np.int64)
             gids = [len(gid), *_listed(raw.encode(gid), pieces)]
-            self._gids[place] = (gid, number)
         presence = None
         if block.ends is not None:
             present = int(np.maximum(block.ends[1] - block.ends[0], 0).sum())

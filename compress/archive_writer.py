@@ -204,6 +204,7 @@ class ArchiveWriter:
             # The row makes the chunk one of the archive: it comes when all of it is there.
             os.fdatasync(self._descriptor)
             _write_at(self._descriptor, row, self._places.index + self._count * ROW.size)
+        self._records.remember(chunk, self._count)
         self._remember(
             chunk.steps,
             end,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import os
 import shutil
@@ -390,6 +391,24 @@ def test_memory_of_a_writer_does_not_grow_with_the_archive(tmp_path):
         tracemalloc.stop()
     # Not even a number of 8 bytes more for each of 500 chunks.
     assert held[1] - held[0] < 4000
+
+
+def test_a_chunk_appended_again_after_a_full_disk_is_read(
+    tmp_path, archive_path, chunks, monkeypatch
+):
+    path = tmp_path / "a.tta"
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with ArchiveWriter(path, FIELDS, settings=SETTINGS, provenance={"seed": 7}) as writer:
+        for chunk in chunks:
+            with monkeypatch.context() as patched:
+                patched.setattr(os, "pwrite", full)
+                with pytest.raises(OutputError, match="No space left"):
+                    writer.append(chunk)
+            writer.append(chunk)
+    assert path.read_bytes() == archive_path.read_bytes()
 
 
 def test_existing_files_and_second_writers_are_refused(tmp_path, chunks):
