@@ -11,6 +11,7 @@ Symbols: n bodies, T steps of time, w components.
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from compress import tt_natural, tt_tensorised
 from compress._bytes import Bytes, number
-from compress.bounds import Target, measure
+from compress.bounds import Target, measure, norm
 from compress.effort import BEST, Effort
 from compress.step_search import CLOSE, SEEK
 
@@ -86,7 +87,7 @@ def encode(
     if target.exact or not values.size:
         return raw
     steps, _, width = values.shape
-    if form == "tensorised" and measure(values, 0.0 * values).frobenius > target.frobenius:
+    if form == "tensorised" and not target.met_by(measure(values, np.zeros_like(values))):
         coded = _encode_tensorised(values, target, order)
     elif steps * width > SECTION_COLUMNS and steps > 1:
         coded = _encode_sections(values, target, effort)
@@ -174,8 +175,12 @@ def _encode_tensorised(values: NDArray, target: Target, order: NDArray | None) -
     head = Header(TENSORISED, values.dtype, values.shape).pack()
     # Pointwise errors are spread about as those of independent numbers.
     frobenius = min(target.frobenius, 0.25 * target.maximum * math.sqrt(values.size))
+    if frobenius >= norm(values):
+        # A few entries stand out, which a train of zeros would lose.
+        frobenius = 0.5 * norm(values)
     best = None
     for _ in range(TRIALS):
+        frobenius = min(frobenius, sys.float_info.max)
         code = tt_tensorised.encode(values, order, Target(frobenius))
         if code is None or len(code) >= values.nbytes:
             break

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from compress._bytes import Bytes
 from compress.bounds import Bound, Target, measure, norm
 from compress.quantise import round_matrix, unround
 from compress.step_search import Seeker, step_code, step_size
-from compress.tt_coder import decode, encode, pays
+from compress.tt_coder import TENSORISED, Header, decode, encode, pays
 
 FORMS = ("natural", "tensorised")
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -94,6 +95,26 @@ def test_error_keeps_to_the_pointwise_bound(seed, bodies, tolerance, form):
     target = Bound("pointwise", tolerance).target(values)
     errors = measure(values, decode(encode(values, target, form=form)))
     assert errors.maximum <= tolerance
+
+
+@pytest.mark.parametrize("frobenius", [math.inf, 3.0])
+@pytest.mark.parametrize("order", [None, np.random.default_rng(20).permutation(200)])
+def test_pointwise_targets_give_the_tensorised_form_asked_for(frobenius, order):
+    values = low_rank(21, (12, 200, 3), 3, 1e-3)
+    target = Target(frobenius, maximum=5e-2)
+    data = encode(values, target, order=order, form="tensorised")
+    assert Header.read(Bytes(data)).mode == TENSORISED
+    assert target.met_by(measure(values, decode(data, order)))
+
+
+def test_one_entry_that_stands_out_is_no_reason_to_keep_the_block_as_it_is():
+    # The norm is below what independent errors of this size would have.
+    values = low_rank(22, (12, 200, 3), 2, 0.0)
+    values[5, 100, 1] = 1e3
+    target = Target(maximum=900.0)
+    data = encode(values, target, form="tensorised")
+    assert pays(data)
+    assert target.met_by(measure(values, decode(data)))
 
 
 def test_nearly_all_of_the_target_is_used():
@@ -216,6 +237,10 @@ def test_hard_cases_keep_to_the_bound(values, form):
             target = Target(frobenius=1e-2)
         data = encode(values, target, form=form)
         assert target.met_by(measure(values, decode(data)))
+        assert len(data) <= values.nbytes + 16
+        pointwise = Target(maximum=tolerance * float(np.abs(values).max()) or 1e-2)
+        data = encode(values, pointwise, form=form)
+        assert pointwise.met_by(measure(values, decode(data)))
         assert len(data) <= values.nbytes + 16
 
 
