@@ -159,6 +159,15 @@ class Record:
     end: int
 
 
+def ascend(steps: NDArray, last: int | None) -> bool:
+    """Whether there are steps, each behind the one before, the first behind `last` (None: any)."""
+    return (
+        len(steps) > 0
+        and bool((steps[1:] > steps[:-1]).all())
+        and (last is None or bool(steps[0] > last))
+    )
+
+
 class RecordWriter:
     """Puts chunks into records; knows which gids are in the file already."""
 
@@ -304,6 +313,8 @@ class _Head:
             self._block(entry, place, len(steps), known)
             for place, entry in enumerate(block_entries)
         )
+        if not ascend(steps, known[-1].steps[-1] if known else None):
+            raise DamageError("steps do not ascend")
         if self._place != self._end:
             raise ValueError("pieces do not fill it")
         return Record(steps, times, blocks, start, self._end)

@@ -21,6 +21,7 @@ from compress.archive_format import (
     Places,
     Record,
     RecordWriter,
+    ascend,
     create,
     open_archive,
 )
@@ -174,8 +175,8 @@ class ArchiveWriter:
     def append(self, chunk: Chunk) -> CodedChunk:
         """Code all blocks of a chunk in this process, and append it.
 
-        Raises InputError for values that the bound of their field does not allow, OutputError if
-        the archive cannot be written.
+        Raises InputError for values that the bound of their field does not allow and for steps
+        that do not ascend from those in the archive, OutputError if it cannot be written.
         """
         encoders = [
             Encoder(self.header.fields, self.header.settings, self.memory(place))
@@ -191,9 +192,17 @@ class ArchiveWriter:
         return coded
 
     def append_coded(self, chunk: CodedChunk) -> None:
-        """Append a chunk that ranks have coded. When this returns a killed process loses none."""
+        """Append a chunk that ranks have coded. When this returns a killed process loses none.
+
+        Raises InputError for steps that do not ascend or are not behind those in the archive,
+        OutputError if the archive cannot be written.
+        """
         if not len(chunk.steps) or len(chunk.steps) != len(chunk.times):
             raise ValueError(f"{len(chunk.steps)} steps with {len(chunk.times)} times")
+        if not ascend(chunk.steps, self._last_step):
+            behind = "" if self._last_step is None else f" behind step {self._last_step}"
+            first, last = int(chunk.steps[0]), int(chunk.steps[-1])
+            raise InputError(f"{self.path}: steps {first} to {last} do not ascend{behind}")
         record, row = self._records.record(chunk, self._count, self._end)
         end = self._end + len(record)
         with self._writing():

@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 import pytest
 
+from compress import archive_writer
 from compress.archive import Archive, ArchiveWriter, Block, Chunk, FieldSpec, Settings
 from compress.bounds import Bound, measure
 from compress.compare import compare_archives, compare_with_chunks
@@ -409,6 +410,40 @@ def test_a_chunk_appended_again_after_a_full_disk_is_read(
                     writer.append(chunk)
             writer.append(chunk)
     assert path.read_bytes() == archive_path.read_bytes()
+
+
+@pytest.mark.parametrize("steps", [[3, 4], [4, 4], [6, 5], [5, 5], [-2, -1]])
+def test_steps_that_do_not_ascend_are_refused(tmp_path, steps):
+    fields = {"x": FieldSpec(Bound("exact"))}
+
+    def still(steps):
+        block = Block(np.arange(2), {"x": np.zeros((len(steps), 2, 1))})
+        return Chunk(np.array(steps, int), 1.0 * np.array(steps), (block,))
+
+    path = tmp_path / "a.tta"
+    with ArchiveWriter(path, fields) as writer:
+        writer.append(still([3, 4]))
+        with pytest.raises(InputError, match=r"a\.tta: steps .* do not ascend behind step 4"):
+            writer.append(still(steps))
+        writer.append(still([7, 9]))
+    with Archive(path) as archive:
+        assert archive.steps.tolist() == [3, 4, 7, 9]
+
+
+@pytest.mark.parametrize(
+    "numbers", [[[0, 1], [1, 2]], [[2, 3], [0, 1]], [[1, 0]], [[0, 1, 1]], [[2, 5, 4]]]
+)
+def test_archives_whose_steps_do_not_ascend_are_refused(tmp_path, monkeypatch, numbers):
+    fields = {"x": FieldSpec(Bound("exact"))}
+    path = tmp_path / "a.tta"
+    monkeypatch.setattr(archive_writer, "ascend", lambda *_: True)
+    writer = ArchiveWriter(path, fields)
+    for steps in numbers:
+        block = Block(np.arange(2), {"x": np.zeros((len(steps), 2, 1))})
+        writer.append(Chunk(np.array(steps, int), 1.0 * np.array(steps), (block,)))
+    writer.abandon()
+    with pytest.raises(DataError, match=rf"a\.tta: damaged: chunk {len(numbers) - 1}: steps"):
+        Archive(path)
 
 
 def test_existing_files_and_second_writers_are_refused(tmp_path, chunks):
