@@ -2,7 +2,8 @@
 
 A *block* is the share of one rank in one chunk of time steps: rows of bodies in the order of
 their numbers (gid), each present from some step of the chunk up to another. A block is coded by
-itself; what is carried from chunk to chunk is only what paid before, and in which order rows lay.
+itself: an order of rows other than by gid is part of its bytes. What is carried from chunk to chunk
+is only which coder paid before, and how large the fields were.
 
 Symbols: T steps of the chunk; n bodies of the block; w components of a field.
 """
@@ -357,11 +358,15 @@ class _Task:
 
 
 def _spatial_order(block: Block, ends: NDArray | None) -> Callable[[], NDArray] | None:
-    """The order of bodies along the Morton curve at the first step, where positions are known."""
+    """The order of bodies along the Morton curve at the first step, None without such positions.
+
+    Positions that are kept exactly need not be finite, and then have none.
+    """
     position = block.fields.get("position")
     if position is None or position.shape[2] != 3 or not position.size:
         return None
-    return lambda: morton_order(held(position, ends)[0])
+    first = held(position, ends)[0]
+    return (lambda: morton_order(first)) if np.isfinite(first).all() else None
 
 
 def _same_bits(values: NDArray, decoded: NDArray) -> bool:

@@ -133,6 +133,20 @@ def test_constants_take_as_many_bytes_as_one_row():
     assert len(encode(encoder_of(Bound("pointwise", 1e-3)), near).fields["x"].data) == 24
 
 
+def test_positions_that_are_not_finite_give_no_order():
+    values = smooth(bodies=64)
+    position = values.copy()
+    position[0, 5, 1] = np.nan
+    fields = {
+        "position": FieldSpec(Bound("exact"), width=3),
+        "velocity": FieldSpec(Bound("relative", 1e-2), width=3),
+    }
+    block = Block(np.arange(64), {"position": position, "velocity": values})
+    coded = Encoder(fields).encode(block, TIMES)
+    assert decode(coded.fields["position"], position).tobytes() == position.tobytes()
+    assert measure(values, decode(coded.fields["velocity"], values)).relative <= 1e-2
+
+
 def test_blocks_share_the_error_of_a_chunk_by_their_entries():
     loud, quiet = smooth(1), 1e-3 * smooth(2, bodies=100)
     blocks = [Block(np.arange(v.shape[1]), {"x": v}) for v in (loud, quiet)]
