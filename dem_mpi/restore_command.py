@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import sys
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -52,17 +54,37 @@ def _names(archive: Archive, selection: Selection) -> tuple[str, ...]:
     return choose("--fields", wanted, archive.fields, archive.path)
 
 
-def _require_bodies(archive: Archive, selection: Selection, found: Restored) -> None:
-    if not len(found.gid):
-        gid = archive.gid
-        held = f"gids {gid[0]} to {gid[-1]}" if len(gid) else "no bodies"
+def _bodies_there(archive: Archive, frames: slice, selection: Selection) -> tuple[NDArray, int]:
+    """Gids of the chunks selected, and rows: a body in a frame each. Decodes no field.
+
+    InputError where bodies are asked for and there are none of them.
+    """
+    gid, rows = np.zeros(0, np.int64), 0
+    for part in archive.iterate([], frames, bodies_of(selection.bodies)):
+        gid = np.union1d(gid, part.gid)
+        rows += int(part.present.sum())
+    if selection.bodies != ALL and not len(gid):
+        held = archive.gid
+        text = f"gids {held[0]} to {held[-1]}" if len(held) else "no bodies"
         raise InputError(
-            f"--bodies {range_text(selection.bodies)}: {archive.path} holds {held}, none of these "
+            f"--bodies {range_text(selection.bodies)}: {archive.path} holds {text}, none of these "
             "in these steps"
         )
+    return gid, rows
+
+
+def _is_array(archive: Archive) -> bool:
+    """Whether it was made of an array. One of a single dimension has steps of shape ()."""
+    shaped = any(spec.shape for spec in archive.fields.values())
+    return shaped or is_array(str(archive.provenance.get("source", "")))
 
 
 # ---- restore -------------------------------------------------------------------------------
+
+
+def warn(text: str) -> None:
+    """Say on stderr what does not end the program."""
+    print(f"dem-mpi: warning: {text}", file=sys.stderr, flush=True)
 
 
 def restore_file(
@@ -72,31 +94,48 @@ def restore_file(
     with Archive(path) as archive:
         names, frames = _names(archive, selection), frames_of(archive, selection.steps)
         out = _place(archive, names, out, force)
-        # It takes its name when it is whole: damage may show half-way.
-        part = out.with_name(f"{out.name}.part")
-        try:
-            rows = _WRITERS[out.suffix](archive, names, frames, selection, part)
-            with agree(Parallel.alone(), out, "write"):
-                part.replace(out)
-        finally:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
+        gid, _ = _bodies_there(archive, frames, selection)
+        with _whole_file(out) as part:
+            rows = _WRITERS[out.suffix](archive, names, frames, gid, selection, part)
+        if not archive.complete:
+            warn(f"{path}: archive is not complete, it ends with step {archive.steps[-1]}")
     size = readable_size(out.stat().st_size)
     count = frames.stop - frames.start
     say(f"wrote {out}: {count:,} frames, {rows:,} bodies, {', '.join(names)}; {size}")
+    if out.suffix == ".npz":
+        for name, member in _members(names).items():
+            if name != member:
+                say(f"note: field {name} is {member} in {out}")
+
+
+@contextlib.contextmanager
+def _whole_file(out: Path) -> Iterator[Path]:
+    """A file to write, which takes its name when it is whole: damage may show half-way."""
+    part = out.with_name(f"{out.name}.part")
+    try:
+        yield part
+        with agree(Parallel.alone(), out, "write"):
+            part.replace(out)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def _refuse_place(archive: Archive, out: Path, force: bool) -> None:
+    refuse_place("--output", out, force)
+    if out.exists() and out.samefile(archive.path):
+        raise InputError(f"--output {out}: is the archive itself")
 
 
 def _place(archive: Archive, names: tuple[str, ...], out: Path | None, force: bool) -> Path:
     """Where to write. InputError for a file that cannot hold the fields, or may not be written."""
     path = archive.path
-    placed = "position" in names and not archive.fields["position"].shape
+    placed = "position" in names and not _is_array(archive)
     if out is None:
         out = path.with_name(f"{path.name.split('.')[0]}.restored{'.h5' if placed else '.npz'}")
     if out.suffix not in _WRITERS:
         raise InputError(f"--output {out}: must end in {', '.join(_WRITERS)}")
-    refuse_place("--output", out, force)
-    if out.exists() and out.samefile(path):
-        raise InputError(f"--output {out}: is the archive itself")
+    _refuse_place(archive, out, force)
     if out.suffix == ".h5" and not placed:
         why = "is not in --fields" if "position" in archive.fields else "is not archived"
         raise InputError(
@@ -110,10 +149,14 @@ def _place(archive: Archive, names: tuple[str, ...], out: Path | None, force: bo
 
 
 def _write_trajectory(
-    archive: Archive, names: tuple[str, ...], frames: slice, selection: Selection, out: Path
+    archive: Archive,
+    names: tuple[str, ...],
+    frames: slice,
+    gid: NDArray,
+    selection: Selection,
+    out: Path,
 ) -> int:
     """A file that the run itself could have written, but for the errors; a chunk at a time."""
-    parallel = Parallel.alone()
     fields = [
         Field(name, np.dtype(spec.dtype).str.lstrip("<=|"), spec.width, spec.unit)
         for name, spec in archive.fields.items()
@@ -124,84 +167,89 @@ def _write_trajectory(
         "version": __version__,
         "restored_from": str(archive.path),
     }
-    trajectory, most = None, 0
+    most = 0
+    trajectory = Trajectory.create(Parallel.alone(), out, fields, attributes, bodies=len(gid))
     try:
         for part in archive.iterate(names, frames, bodies_of(selection.bodies)):
-            if trajectory is None:
-                _require_bodies(archive, selection, part)
-                trajectory = Trajectory.create(
-                    parallel, out, fields, attributes, bodies=len(part.gid)
-                )
             for k, step in enumerate(part.steps.tolist()):
                 there = part.present[k]
                 rows = {name: values[k, there] for name, values in part.fields.items()}
                 rows["gid"] = part.gid[there]
                 most = max(most, len(rows["gid"]))
                 trajectory.write_frame(step, float(part.times[k]), rows)
-        assert trajectory is not None
         trajectory.seal()
     finally:
-        if trajectory is not None:
-            trajectory.close()
+        trajectory.close()
     return most
 
 
 def _write_array(
-    archive: Archive, names: tuple[str, ...], frames: slice, selection: Selection, out: Path
+    archive: Archive,
+    names: tuple[str, ...],
+    frames: slice,
+    gid: NDArray,
+    selection: Selection,
+    out: Path,
 ) -> int:
     """An array (T, m, w), or of the shape it had, chunk by chunk; NaN where a body is not there."""
     (name,) = names
     spec = archive.fields[name]
-    whole = bool(spec.shape) and selection.bodies == ALL
+    whole = _is_array(archive) and selection.bodies == ALL
+    tail = spec.shape if whole else (len(gid), *([spec.width] * (spec.width > 1)))
     with agree(Parallel.alone(), out, "write"):
-        gid, array, done = None, None, 0
-        bodies = bodies_of(selection.bodies)
-        for part in archive.iterate([name], frames, bodies):
-            if array is None:
-                gid = _all_gids(archive, bodies)
-                _require_bodies(archive, selection, part)
-                tail = spec.shape if whole else (len(gid), *([spec.width] * (spec.width > 1)))
-                array = np.lib.format.open_memmap(
-                    out, "w+", np.dtype(spec.dtype), (frames.stop - frames.start, *tail)
-                )
-            assert gid is not None
+        array = np.lib.format.open_memmap(
+            out, "w+", np.dtype(spec.dtype), (frames.stop - frames.start, *tail)
+        )
+        done = 0
+        for part in archive.iterate([name], frames, bodies_of(selection.bodies)):
             rows = np.zeros((len(part.steps), len(gid), spec.width), spec.dtype)
             if rows.dtype.kind == "f":
                 rows[:] = np.nan
             rows[:, np.searchsorted(gid, part.gid)] = part.fields[name]
-            array[done : done + len(rows)] = rows.reshape(len(rows), *array.shape[1:])
+            array[done : done + len(rows)] = rows.reshape(len(rows), *tail)
             done += len(rows)
         array.flush()
     return len(gid)
 
 
-def _all_gids(archive: Archive, bodies: slice | None) -> NDArray:
-    """Gids of all bodies of the archive that lie in a range."""
-    gid = archive.gid
-    if bodies is not None:
-        low = 0 if bodies.start is None else bodies.start
-        high = np.iinfo(np.int64).max if bodies.stop is None else bodies.stop
-        gid = gid[(gid >= low) & (gid < high)]
-    return gid
-
-
 def _write_arrays(
-    archive: Archive, names: tuple[str, ...], frames: slice, selection: Selection, out: Path
+    archive: Archive,
+    names: tuple[str, ...],
+    frames: slice,
+    gid: NDArray,
+    selection: Selection,
+    out: Path,
 ) -> int:
     """All in one file of arrays: step, time, gid, present, and the fields."""
     found = archive.read(names, frames, bodies_of(selection.bodies))
-    _require_bodies(archive, selection, found)
-    arrays = {"step": found.steps, "time": found.times, "gid": found.gid, "present": found.present}
-    for name, values in found.fields.items():
-        spec = archive.fields[name]
-        if spec.shape and selection.bodies == ALL:
-            arrays[name] = values.reshape(len(values), *spec.shape)
-        else:
-            arrays[name] = values[:, :, 0] if spec.width == 1 else values
-    # Given its name numpy would write to one with another ending.
-    with agree(Parallel.alone(), out, "write"), out.open("wb") as file:
-        np.savez(file, **arrays)
-    return len(found.gid)
+    whole = _is_array(archive) and selection.bodies == ALL
+    arrays = dict(
+        zip(_OF_FRAMES, (found.steps, found.times, found.gid, found.present), strict=True)
+    )
+    for name, member in _members(names).items():
+        spec, values = archive.fields[name], found.fields[name]
+        tail = spec.shape if whole else values.shape[1 : 2 + (spec.width > 1)]
+        arrays[member] = values.reshape(len(values), *tail)
+    # numpy's own function for this has parameters that fields may be called like.
+    with agree(Parallel.alone(), out, "write"), zipfile.ZipFile(out, "w") as file:
+        for member, values in arrays.items():
+            with file.open(f"{member}.npy", "w", force_zip64=True) as place:
+                np.lib.format.write_array(place, values, allow_pickle=False)
+    return len(gid)
+
+
+_OF_FRAMES = ("step", "time", "gid", "present")
+
+
+def _members(names: tuple[str, ...]) -> dict[str, str]:
+    """What fields are called in a file of arrays, where some names are taken."""
+    members: dict[str, str] = {}
+    for name in names:
+        member = name
+        while member in _OF_FRAMES or member in members.values():
+            member = f"field_{member}"
+        members[name] = member
+    return members
 
 
 _WRITERS = {".h5": _write_trajectory, ".npz": _write_arrays, ".npy": _write_array}
@@ -217,30 +265,34 @@ def slice_file(
     with Archive(path) as archive:
         names, frames = _names(archive, selection), frames_of(archive, selection.steps)
         if out is not None:
-            refuse_place("--output", out, force)
-        found = archive.read(names, frames, bodies_of(selection.bodies))
-        _require_bodies(archive, selection, found)
-        specs = archive.fields
-    rows = int(found.present.sum())
-    if out is None and rows > _MOST_ROWS:
-        raise InputError(
-            f"{rows:,} rows are too many to print: ask for fewer with --steps and --bodies, or "
-            "give --output FILE.csv, or use dem-mpi restore"
-        )
-    titles = ["step", "time", "gid"]
-    for name in names:
-        w = specs[name].width
-        titles += [name] if w == 1 else [f"{name}_{'xyz'[k] if w == 3 else k}" for k in range(w)]
-    if out is None:
-        say("  ".join(titles))
-        for row in _rows(found, names):
-            say("  ".join(row))
-        return
-    with agree(Parallel.alone(), out, "write"), out.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(titles)
-        writer.writerows(_rows(found, names))
-    say(f"wrote {out}: {rows:,} rows")
+            _refuse_place(archive, out, force)
+        _, count = _bodies_there(archive, frames, selection)
+        if out is None and count > _MOST_ROWS:
+            raise InputError(
+                f"{count:,} rows are too many to print: ask for fewer with --steps and --bodies, "
+                "or give --output FILE.csv, or use dem-mpi restore"
+            )
+        titles = ["step", "time", "gid"]
+        for name in names:
+            w = archive.fields[name].width
+            titles += (
+                [name] if w == 1 else [f"{name}_{'xyz'[k] if w == 3 else k}" for k in range(w)]
+            )
+        parts = archive.iterate(names, frames, bodies_of(selection.bodies))
+        rows = (row for part in parts for row in _rows(part, names))
+        if out is None:
+            for row in (titles, *rows):
+                say("  ".join(row))
+            return
+        with (
+            _whole_file(out) as whole,
+            agree(Parallel.alone(), out, "write"),
+            whole.open("w", newline="") as file,
+        ):
+            writer = csv.writer(file)
+            writer.writerow(titles)
+            writer.writerows(rows)
+    say(f"wrote {out}: {count:,} rows")
 
 
 def _rows(found: Restored, names: tuple[str, ...]) -> Iterator[list[str]]:

@@ -9,9 +9,14 @@ import sys
 import numpy as np
 import pytest
 
-from compress.archive import Archive
+from compress.archive import Archive, ArchiveWriter, Block, Chunk, FieldSpec
+from compress.bounds import Bound
+from dem_mpi import restore_command
+from dem_mpi.compress_options import ALL, Selection
+from dem_mpi.errors import InputError
 from dem_mpi.output import read_frame
 from dem_mpi.parallel import Parallel
+from dem_mpi.restore_command import restore_file, slice_file
 
 from launch import ROOT, run_ranks
 from runs import PILE, messages, simulate
@@ -207,3 +212,132 @@ def test_every_option_is_explained(name, folder):
     done = verb(folder, name, "--help")
     assert done.returncode == 0
     assert "Exit codes" in done.stdout
+
+
+# ---- archives that are not of a run from its first frame to its last -----------------------
+
+
+def archived(path, bodies, *, name="v", complete=True, source="run.h5"):
+    """An archive of a chunk of two steps for each number of bodies, gids from 0 on."""
+    writer = ArchiveWriter(path, {name: FieldSpec(Bound("exact"))}, provenance={"source": source})
+    for k, n in enumerate(bodies):
+        steps = np.arange(2) + 2 * k
+        v = 10.0 * steps[:, None, None] + np.arange(n)[:, None]
+        writer.append(Chunk(steps, steps * 0.1, (Block(np.arange(n), {name: v}),)))
+    if complete:
+        writer.close()
+    else:
+        writer.abandon()
+    return path
+
+
+def restored(path, out, bodies=ALL, steps=ALL):
+    """What restore writes of an archive, and what it says."""
+    said = []
+    restore_file(path, Selection(steps=steps, bodies=bodies), out, True, said.append)
+    return np.load(out), said
+
+
+@pytest.mark.parametrize("ending", ["npy", "npz"])
+def test_bodies_that_come_later_are_restored(tmp_path, ending):
+    path = archived(tmp_path / "late.tt.h5", [0, 4, 8])
+    for bodies, columns in ((ALL, 8), ((5, 7), 2)):
+        found, _ = restored(path, tmp_path / f"late.{ending}", bodies)
+        v = found if ending == "npy" else found["v"]
+        assert v.shape == (6, columns)
+        assert np.isnan(v[:2]).all()
+        assert v[4].tolist() == [40.0 + k for k in range(*(bodies if bodies != ALL else (0, 8)))]
+    with pytest.raises(InputError, match="none of these"):
+        restored(path, tmp_path / f"late.{ending}", (5, 7), (0, 4))
+
+
+@pytest.mark.parametrize("ending", ["npy", "npz"])
+def test_frames_without_bodies_are_restored(tmp_path, ending):
+    path = archived(tmp_path / "empty.tt.h5", [0])
+    found, _ = restored(path, tmp_path / f"empty.{ending}")
+    assert (found if ending == "npy" else found["v"]).shape == (2, 0)
+
+
+def test_a_trajectory_begins_before_its_bodies(tmp_path):
+    writer = ArchiveWriter(tmp_path / "a.tt.h5", {"position": FieldSpec(Bound("exact"), width=3)})
+    with writer:
+        for k, n in enumerate((0, 3)):
+            steps, x = np.arange(2) + 2 * k, np.full((2, n, 3), float(k))
+            writer.append(Chunk(steps, steps * 0.1, (Block(np.arange(n), {"position": x}),)))
+    out = tmp_path / "back.h5"
+    restore_file(tmp_path / "a.tt.h5", Selection(), out, False, lambda text: None)
+    assert [len(read_frame(out, k).columns["gid"]) for k in range(4)] == [0, 0, 3, 3]
+
+
+def test_arrays_have_the_bodies_of_the_steps_asked_for(tmp_path):
+    path = archived(tmp_path / "grow.tt.h5", [4, 8])
+    array, _ = restored(path, tmp_path / "a.npy", steps=(0, 2))
+    arrays, _ = restored(path, tmp_path / "a.npz", steps=(0, 2))
+    assert np.array_equal(array, arrays["v"])
+    assert array.shape == (2, 4)
+
+
+@pytest.mark.parametrize("name", ["file", "step", "time", "gid", "present"])
+def test_fields_may_be_called_like_members(tmp_path, name):
+    path = archived(tmp_path / "a.tt.h5", [3], name=name)
+    found, said = restored(path, tmp_path / "a.npz")
+    member = name if name == "file" else f"field_{name}"
+    assert found[member].tolist() == [[0.0, 1.0, 2.0], [10.0, 11.0, 12.0]]
+    assert found["step"].tolist() == [0, 1] and found["gid"].tolist() == [0, 1, 2]
+    assert any(member in line for line in said[1:]) == (name != "file")
+
+
+@pytest.mark.parametrize("ending", ["npy", "npz"])
+def test_an_array_of_one_dimension_comes_back_as_one(tmp_path, ending):
+    path = archived(tmp_path / "line.tt.h5", [1, 1], source="line.npy")
+    found, _ = restored(path, tmp_path / f"line.{ending}")
+    v = found if ending == "npy" else found["v"]
+    assert v.tolist() == [0.0, 10.0, 20.0, 30.0]
+    found, _ = restored(
+        archived(tmp_path / "run.tt.h5", [1, 1]), tmp_path / f"run.{ending}"
+    )  # one body of a run
+    assert (found if ending == "npy" else found["v"]).shape == (4, 1)
+
+
+def test_an_interrupted_archive_is_told_to_be_so(tmp_path, capsys):
+    restored(archived(tmp_path / "whole.tt.h5", [3]), tmp_path / "a.npy")
+    assert capsys.readouterr().err == ""
+    restored(archived(tmp_path / "part.tt.h5", [3], complete=False), tmp_path / "a.npy")
+    assert "archive is not complete" in capsys.readouterr().err
+
+
+# ---- slice ---------------------------------------------------------------------------------
+
+
+def test_a_slice_does_not_replace_its_archive(tmp_path):
+    path = archived(tmp_path / "a.tt.h5", [3])
+    with pytest.raises(InputError, match="is the archive itself"):
+        slice_file(path, Selection(), path, True, print)
+    with Archive(path) as archive:
+        assert archive.complete
+
+
+def test_rows_too_many_to_print_are_counted_without_decoding(tmp_path, monkeypatch):
+    opened = []
+
+    class Kept(Archive):
+        def __init__(self, path):
+            super().__init__(path)
+            opened.append(self)
+
+    monkeypatch.setattr(restore_command, "Archive", Kept)
+    path, said = archived(tmp_path / "a.tt.h5", [3000, 3000]), []
+    with pytest.raises(InputError, match="12,000 rows are too many"):
+        slice_file(path, Selection(), None, False, said.append)
+    assert not said and opened[0].decoded_pieces == 0
+
+
+def test_rows_are_written_chunk_by_chunk(tmp_path):
+    path, out = archived(tmp_path / "a.tt.h5", [0, 2, 3]), tmp_path / "a.csv"
+    slice_file(path, Selection(), out, False, lambda text: None)
+    lines = [line.split(",") for line in out.read_text().splitlines()]
+    assert lines[0] == ["step", "time", "gid", "v"]
+    assert [(int(a), int(c), float(d)) for a, _, c, d in lines[1:]] == [
+        (step, gid, 10.0 * step + gid) for step in range(2, 6) for gid in range(2 + (step > 3))
+    ]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "a.tt.h5"]
