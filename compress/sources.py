@@ -22,6 +22,8 @@ from dem_mpi.errors import DataError, InputError
 from dem_mpi.h5files import HDF5_ERRORS, open_checked, reason
 
 _MOST_COMPONENTS = 16
+HDF5_SUFFIXES = (".h5", ".hdf5", ".hdf", ".he5", ".nc", ".nc4")
+_MOST_NAMES = 10  # of data sets, that a message tells
 
 
 @dataclass(frozen=True)
@@ -95,14 +97,19 @@ def open_array(source: str, axis: int = 0) -> ArraySource:
     else:
         file, separator, inside = source.rpartition(":")
         if not separator or not inside:
+            name = source.rstrip(":")
+            if name.endswith(HDF5_SUFFIXES):
+                raise InputError(f"{name}: name a data set in it, {name}:/path{_names(Path(name))}")
             raise InputError(f"{source}: neither a .npy file nor one of HDF5 with ':/data/set'")
         array, name = _open_dataset(Path(file), inside), inside.rstrip("/").rpartition("/")[2]
     if array.ndim < 1 or not -array.ndim <= axis < array.ndim:
+        shape = array.shape
         _close(array)
-        raise InputError(f"{source}: shape {array.shape} has no axis {axis} for time")
+        raise InputError(f"{source}: shape {shape} has no axis {axis} for time")
     if array.dtype.kind not in "biuf" or array.dtype.itemsize > 8:
+        dtype = array.dtype
         _close(array)
-        raise InputError(f"{source}: {array.dtype} is no plain number of at most 8 bytes")
+        raise InputError(f"{source}: {dtype} is no plain number of at most 8 bytes")
     return ArraySource(name, source, array, axis % array.ndim)
 
 
@@ -120,11 +127,35 @@ def _open_npy(path: Path) -> NDArray:
 
 def _open_dataset(path: Path, name: str) -> h5py.Dataset:
     file = open_checked(path)
-    dataset = file.get(name)
+    try:
+        dataset = file.get(name)
+    except HDF5_ERRORS as error:
+        file.close()
+        raise DataError(f"{path}: cannot be read: {reason(error)}") from None
     if not isinstance(dataset, h5py.Dataset):
         file.close()
-        raise InputError(f"{path}: no data set '{name}'")
+        raise InputError(f"{path}: no data set '{name}'{_names(path)}")
     return dataset
+
+
+def _names(path: Path) -> str:
+    """What data sets there are, as the end of a message."""
+    found: list[str] = []
+
+    def note(name: str, item: h5py.Group | h5py.Dataset) -> bool | None:
+        if isinstance(item, h5py.Dataset):
+            found.append(f"/{name}")
+        return len(found) > _MOST_NAMES or None
+
+    with open_checked(path) as file:
+        try:
+            file.visititems(note)
+        except HDF5_ERRORS as error:
+            raise DataError(f"{path}: cannot be read: {reason(error)}") from None
+    if not found:
+        return "; it has none"
+    more = ", ..." if len(found) > _MOST_NAMES else ""
+    return f"; it has {', '.join(found[:_MOST_NAMES])}{more}"
 
 
 def _close(array: h5py.Dataset | NDArray) -> None:

@@ -81,15 +81,21 @@ def test_chunks_go_on_from_any_step(tmp_path):
     [
         ("none.npy", "no such file"),
         ("none.h5:/x", "no such file"),
-        ("run.h5", "neither a .npy file nor"),
-        ("run.h5:/none", "no data set '/none'"),
-        ("run.h5:/group", "no data set '/group'"),
+        ("run.txt", "neither a .npy file nor"),
+        ("run.h5", "run.h5:/path; it has /group/field"),
+        ("run.h5:", "run.h5:/path; it has /group/field"),
+        ("run.h5:/none", "no data set '/none'; it has /group/field"),
+        ("run.h5:/group", "no data set '/group'; it has /group/field"),
+        ("scalar.nc:/x", r"scalar.nc:/x: shape \(\) has no axis 0"),
+        ("scalar.nc:/text", r"scalar.nc:/text: \|S1 is no plain number"),
         ("complex.npy", "no plain number"),
         ("scalar.npy", "no axis 0"),
     ],
 )
 def test_what_cannot_be_read_is_refused(tmp_path, name, message):
     saved(tmp_path, np.zeros(3), "h5")
+    with h5py.File(tmp_path / "scalar.nc", "w") as file:
+        file["x"], file["text"] = 1.0, np.array([b"a", b"b"])
     np.save(tmp_path / "complex.npy", np.zeros(3, complex))
     np.save(tmp_path / "scalar.npy", np.float64(1.0))
     with pytest.raises(InputError, match=message):
