@@ -184,7 +184,7 @@ class ArchiveWriter:
         ]
         scales = [e.scales(b) for e, b in zip(encoders, chunk.blocks, strict=True)]
         blocks = tuple(
-            encoder.encode(block, chunk.times, scales)
+            encoder.encode(block, chunk.times, scales, chunk.steps)
             for encoder, block in zip(encoders, chunk.blocks, strict=True)
         )
         coded = CodedChunk(chunk.steps, chunk.times, blocks)

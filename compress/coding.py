@@ -212,8 +212,9 @@ class Encoder:
         block: Block,
         times: NDArray,
         scales: Sequence[Mapping[str, Scale]] | None = None,
+        steps: NDArray | None = None,
     ) -> CodedBlock:
-        """Code a block; times : (T,) [s] of its steps.
+        """Code a block; times : (T,) [s] of its steps, steps : (T,) their numbers, for errors.
 
         `scales` are those of all blocks of the chunk, None: of this one alone. The blocks of a
         chunk share its relative bound evenly over their entries. Raises InputError for values
@@ -231,7 +232,7 @@ class Encoder:
             spec = self.fields[name]
             values = held(block.fields[name], ends)
             if spec.bound.kind != "exact" and values.dtype.kind == "f":
-                _require_finite(name, values, block.gid)
+                _require_finite(name, values, block.gid, present, steps)
             guide = None if spec.guide is None else increments(decoded[spec.guide], times)
             context = coders.Context(guide, order)
             target = self._target(name, values.dtype, rows * spec.width, whole[name])
@@ -476,12 +477,26 @@ def check_block(block: Block, fields: Mapping[str, FieldSpec], steps: int) -> No
             raise ValueError(f"presence: must be within the {steps} steps, one a body")
 
 
-def _require_finite(name: str, values: NDArray, gid: NDArray) -> None:
+def _require_finite(
+    name: str,
+    values: NDArray,
+    gid: NDArray,
+    present: NDArray | None,
+    steps: NDArray | None,
+) -> None:
     if math.isfinite(largest(values)):
         return
-    finite = np.isfinite(values)
-    step, row, component = (int(i) for i in np.argwhere(~finite)[0])
+    bad = ~np.isfinite(values)
+    if present is not None:
+        bad &= present[:, :, None]
+    step, row, component = (int(i) for i in np.argwhere(bad)[0])
+    when = f"{step} of the chunk" if steps is None else f"{int(steps[step])}"
     raise InputError(
-        f"{name}: {values[step, row, component]} at step {step} of the chunk, body "
-        f"{int(gid[row])}, component {component}: only an exact bound keeps it"
+        f"{name}: {values[step, row, component]} at step {when}, body {int(gid[row])}, "
+        f"component {component}: only an exact bound keeps it: {_kept_by(name)}"
     )
+
+
+def _kept_by(name: str) -> str:
+    """How a user says that a field is to be kept exactly."""
+    return f"--field {name}=exact (in a scene, {name}: exact)"

@@ -15,6 +15,7 @@ from compress import coders, raw
 from compress.archive import ArchiveWriter
 from compress.bounds import Bound, Target, measure, norm
 from compress.coding import Block, Encoder, FieldSpec, Memory, Scale, Settings, Winner, held
+from dem_mpi.errors import InputError
 
 from moving_bodies import FIELDS, SETTINGS, chunk_of, falling_bodies
 
@@ -145,6 +146,17 @@ def test_positions_that_are_not_finite_give_no_order():
     coded = Encoder(fields).encode(block, TIMES)
     assert decode(coded.fields["position"], position).tobytes() == position.tobytes()
     assert measure(values, decode(coded.fields["velocity"], values)).relative <= 1e-2
+
+
+def test_values_that_are_not_finite_are_at_a_step_in_which_the_body_is_there():
+    values = smooth(bodies=8)
+    values[:6, 4] = np.nan
+    block = Block(np.arange(8), {"x": values}, first=np.where(np.arange(8) == 4, 5, 0))
+    encoder = encoder_of(Bound("relative", 1e-2))
+    with pytest.raises(InputError, match="nan at step 105, body 4, component 0"):
+        encoder.encode(block, TIMES, steps=100 + np.arange(16))
+    with pytest.raises(InputError, match="nan at step 5 of the chunk, body 4, component 0"):
+        encoder.encode(block, TIMES)
 
 
 def test_blocks_share_the_error_of_a_chunk_by_their_entries():
