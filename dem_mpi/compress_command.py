@@ -1,14 +1,14 @@
 """`dem-mpi compress`: from a trajectory, or an array, to an archive, on any number of ranks.
 
-Bodies are split into blocks by ranges of gid, at least one a rank; a chunk of frames is read,
-coded by all ranks, and appended, before the next. A stop between chunks leaves an archive that
---resume goes on with.
+Bodies are split into blocks by ranges of gid, at least one a rank. Chunk after chunk of frames is
+read, coded by all ranks, and appended: a rank holds its bodies over one chunk, and of an array all
+bodies while it reads. A stop between chunks leaves an archive that --resume goes on with.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -27,6 +27,7 @@ from dem_mpi.compression import (
     block_of,
     compile_kernels,
     fields_text,
+    first_difference,
     guide_of,
 )
 from dem_mpi.errors import DemError, InputError, StoppedError
@@ -36,10 +37,18 @@ from dem_mpi.parallel import Parallel
 from dem_mpi.signals import StopRequest
 from dem_mpi.trajectory_chunks import TrajectoryChunks
 
-_BLOCK_BYTES = 1 << 28  # [B] of values that a block has at most, in one chunk
+_BLOCK_BYTES = 1 << 28  # [B] of values that a block has in one chunk, about, at most
 _TRIAL_EVERY = 1
 _SAMPLED = 4096  # bodies, at most, that an explanation looks at
 _SECONDS_BETWEEN_LINES = 10.0
+# Provenance that has to agree to go on with an archive, and how it is called.
+_ORIGIN = {
+    "source": "source",
+    "digest": "source, or one that has changed",
+    "scene": "scene",
+    "seed": "seed",
+    "chunk": "chunk",
+}
 # What bodies keep for life.
 _CONSTANT = ("radius", "half_length", "shape", "material")
 
@@ -125,13 +134,20 @@ class TrajectorySource:
         size = sum(np.dtype(spec.dtype).itemsize * spec.width for spec in self.specs.values())
         return self._file.bodies * size
 
-    def blocks(self, number: int) -> list[Any]:
-        """Names of so many blocks, for `read`."""
+    def blocks(self, number: int) -> list[tuple[int, int]]:
+        """Ranges [low, high) of gids, for `read_blocks`."""
         return self._file.blocks(number)
 
-    def read(self, frames: range, block: Any, verify: list[int]) -> Block:
-        """A block of these frames; checksums are compared of the frames `verify`."""
-        return block_of(self._file.read(frames, list(self.specs), block, verify))
+    def read_blocks(
+        self, frames: range, blocks: Sequence[tuple[int, int]], verify: Sequence[int]
+    ) -> list[Block]:
+        """Blocks, neighbours in order, of these frames, which are read once.
+
+        Checksums are compared of the frames `verify`.
+        """
+        whole = blocks[0][0], blocks[-1][1]
+        track = self._file.read(frames, list(self.specs), whole, verify)
+        return [block_of(track, gids) for gids in blocks]
 
     def reader(self) -> Callable[[str, int, int], NDArray]:
         """Values (stop - first, n, w) of a field, of bodies that are there all the time."""
@@ -146,12 +162,12 @@ class TrajectorySource:
         return read
 
     def provenance(self) -> dict[str, Any]:
-        """Where the values come from."""
+        """Where the values come from; `digest` tells trajectories apart by how they begin."""
         known = ("name", "scene", "seed", "units")
         kept = {
             name: self._file.attributes[name] for name in known if name in self._file.attributes
         }
-        return {**kept, "source": str(self._file.path)}
+        return {**kept, "source": str(self._file.path), "digest": self._file.digest()}
 
     def lines(self) -> list[str]:
         """What there is, one fact a line."""
@@ -198,8 +214,8 @@ def _specs(file: TrajectoryChunks, options: CompressOptions) -> dict[str, FieldS
 # ---- the work ------------------------------------------------------------------------------
 
 
-def _blocks_of_rank(parallel: Parallel, source: Source, chunk: int) -> list[Any]:
-    """Blocks of this rank: at least one a rank, none larger than a limit, in order of gid."""
+def _blocks_of_rank(parallel: Parallel, source: Source, chunk: int) -> list[tuple[int, int]]:
+    """Blocks of this rank: at least one a rank, of about a limit at most, in order of gid."""
     wanted = -(-min(chunk, len(source.steps)) * source.frame_bytes // _BLOCK_BYTES)
     each = max(1, -(-wanted // parallel.size))
     blocks = source.blocks(each * parallel.size)
@@ -210,11 +226,15 @@ def _open_writer(
     parallel: Parallel, options: CompressOptions, source: Source, blocks: int
 ) -> tuple[ChunkWriter, int]:
     """Collective. The archive to append to, and how many frames of the source it has."""
-    path, settings = options.path, Settings(
-        floor=options.floor, trial_every=_TRIAL_EVERY, step_size=_step_size(source)
-    )  # fmt: skip
+    path, settings = options.path, Settings(options.floor, _TRIAL_EVERY, _step_size(source))
+    provenance = _together(parallel, source.provenance)
+    provenance |= {"chunk": options.chunk, "version": __version__}
     if options.resume and _on_root(parallel, path.exists):
-        writer, last = ChunkWriter.resume(parallel, path, source.specs, settings, None, blocks)
+        origin = {name: provenance.get(name) for name in _ORIGIN}
+        _on_root(parallel, lambda: _refuse_another(path, settings, origin))
+        writer, last = ChunkWriter.resume(
+            parallel, path, source.specs, settings, origin, None, blocks
+        )
         done = int(np.searchsorted(source.steps, last, side="right"))
         error = None
         if parallel.rank == 0:
@@ -227,8 +247,23 @@ def _open_writer(
             writer.abandon()
             raise
         return writer, done
-    provenance = {**source.provenance(), "version": __version__}
     return ChunkWriter.create(parallel, path, source.specs, settings, provenance, blocks), 0
+
+
+def _refuse_another(path: Path, settings: Settings, origin: dict[str, Any]) -> None:
+    """Raise InputError for an archive of another source, or made in another way."""
+    with Archive(path) as archive:
+        found = first_difference(archive, settings, origin)
+    if found is None:
+        return
+    name, had, asked = found
+    remedy = "--force instead of --resume replaces it"
+    if name in ("floor", "chunk"):
+        begun = "without it" if had is None else f"with --{name} {had:g}"
+        raise InputError(f"--{name} {asked:g}: {path} was begun {begun}; {remedy}")
+    values = f" ({had}, not {asked})" if name in ("source", "seed", "step size") else ""
+    another = f"{_ORIGIN.get(name, name)}{values}"
+    raise InputError(f"--resume: {path} was begun with another {another}; {remedy}")
 
 
 def _step_size(source: Source) -> float:
@@ -242,7 +277,7 @@ def _compress_chunks(
     parallel: Parallel,
     source: Source,
     writer: ChunkWriter,
-    blocks: list[Any],
+    blocks: list[tuple[int, int]],
     done: int,
     options: CompressOptions,
     stop: StopRequest,
@@ -265,10 +300,7 @@ def _compress_chunks(
         verify = list(frames[parallel.rank :: parallel.size])
         data = _together(
             parallel,
-            lambda frames=frames, verify=verify: [
-                source.read(frames, block, verify if k == 0 else [])
-                for k, block in enumerate(blocks)
-            ],
+            lambda frames=frames, verify=verify: source.read_blocks(frames, blocks, verify),
         )
         writer.append(
             source.steps[frames.start : frames.stop], source.times[frames.start : frames.stop], data

@@ -12,6 +12,7 @@ again, with all others that came after its checkpoint, and goes on from the fram
 
 from __future__ import annotations
 
+import math
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -185,20 +186,22 @@ class ChunkWriter:
         path: Path,
         fields: Mapping[str, FieldSpec],
         settings: Settings,
+        origin: Mapping[str, Any],
         last_step: int | None,
         blocks: int = 1,
     ) -> tuple[ChunkWriter, int]:
         """Go on with an archive behind `last_step`, None: behind its last chunk.
 
         Returns it with the last step that it holds now, -1 for none. Raises DataError where it is
-        damaged or of other fields or bounds.
+        damaged or of other fields or bounds, InputError where it was begun with other settings or
+        its provenance is not `origin` in what that holds, OutputError where it cannot be written.
         """
         first = parallel.exclusive_sum(blocks)
         total = parallel.sum(blocks)
         writer, found = None, None
         with agree(parallel, path, "resume", DataError):
             if parallel.rank == 0:
-                _refuse_other_fields(path, fields)
+                _refuse_another(path, fields, settings, origin)
                 writer = ArchiveWriter.resume(path, last_step)
                 reached = -1 if writer.last_step is None else writer.last_step
                 found = reached, [writer.memory(k) for k in range(total)]
@@ -242,11 +245,37 @@ class ChunkWriter:
                 writer.abandon()
 
 
-def _refuse_other_fields(path: Path, fields: Mapping[str, FieldSpec]) -> None:
+def _refuse_another(
+    path: Path, fields: Mapping[str, FieldSpec], settings: Settings, origin: Mapping[str, Any]
+) -> None:
     with Archive(path) as archive:
         stored = dict(archive.fields)
+        found = first_difference(archive, settings, origin)
     if stored != dict(fields):
         raise DataError(f"{path}: has other fields or bounds: {fields_text(stored)}")
+    if found is not None:
+        name, had, asked = found
+        raise InputError(f"{path}: was begun with {name} {had}, not {asked}")
+
+
+def first_difference(
+    archive: Archive, settings: Settings, origin: Mapping[str, Any]
+) -> tuple[str, Any, Any] | None:
+    """What keeps an archive from being gone on with: a name, what it has, what is asked for.
+
+    `origin` is the part of the provenance that has to agree. Efforts may differ, chunk by chunk.
+    """
+    had = archive.settings
+    if had.floor != settings.floor:
+        return "floor", had.floor, settings.floor
+    known = had.step_size and settings.step_size
+    # A mean over the frames there are so far: it may differ in the last digits.
+    if known and not math.isclose(had.step_size, settings.step_size):
+        return "step size", had.step_size, settings.step_size
+    for name, asked in origin.items():
+        if archive.provenance.get(name) != asked:
+            return name, archive.provenance.get(name), asked
+    return None
 
 
 def fields_text(fields: Mapping[str, FieldSpec]) -> str:
@@ -254,15 +283,18 @@ def fields_text(fields: Mapping[str, FieldSpec]) -> str:
     return ", ".join(f"{name} ({bound_text(spec)})" for name, spec in fields.items())
 
 
-def block_of(track: Track) -> Block:
-    """Bodies over a chunk as `compress` takes them."""
+def block_of(track: Track, gids: tuple[int, int] | None = None) -> Block:
+    """Bodies over a chunk as `compress` takes them: all, or those of gids [low, high)."""
+    low, high = (0, len(track.gid)) if gids is None else np.searchsorted(track.gid, gids)
     frames = len(next(iter(track.fields.values())))
-    always = not track.first.any() and (track.stop == frames).all()
+    first, stop = track.first[low:high], track.stop[low:high]
+    always = not first.any() and (stop == frames).all()
+    fields = {name: np.ascontiguousarray(v[:, low:high]) for name, v in track.fields.items()}
     return Block(
-        gid=track.gid,
-        fields={k: v if v.ndim == 3 else v[:, :, None] for k, v in track.fields.items()},
-        first=None if always else track.first,
-        stop=None if always else track.stop,
+        gid=track.gid[low:high],
+        fields={name: v if v.ndim == 3 else v[:, :, None] for name, v in fields.items()},
+        first=None if always else first,
+        stop=None if always else stop,
     )
 
 
@@ -311,9 +343,10 @@ class InSitu:
     ) -> tuple[InSitu, str]:
         """Go on from what a checkpoint kept, None where it knew of no archive.
 
-        An archive that cannot be gone on with is kept under another name and a new one begun;
-        the text that is returned tells the user, "" where there is nothing to tell. OutputError
-        where it cannot be written now, as while another process writes it: it stays as it is.
+        An archive that cannot be gone on with, as one of another seed, is kept under another name
+        and a new one begun; the text that is returned tells the user, "" where there is nothing to
+        tell. OutputError where it cannot be written now, as while another process writes it: it
+        stays as it is.
         """
         fields, settings = _of_section(section, step_size)
         buffer = FrameBuffer(list(fields))
@@ -321,7 +354,11 @@ class InSitu:
             expected = -1 if pending is None else pending.archived
             if pending is None:
                 raise DataError(f"{path}: the checkpoint knows of no archive")
-            writer, archived = ChunkWriter.resume(parallel, path, fields, settings, expected)
+            # The rest of the scene was compared with the checkpoint's, and may have been changed.
+            origin = {"seed": provenance["seed"]}
+            writer, archived = ChunkWriter.resume(
+                parallel, path, fields, settings, origin, expected
+            )
             if archived != expected:
                 writer.abandon()
                 raise DataError(

@@ -1,13 +1,15 @@
 """From run.h5 to chunks of frames for `compress`: every body's values over time, by ranges of gid.
 
 In a trajectory the rows of a frame lie in the order of ranks and places; here they come together
-by body, a range of gids at a time, so that memory holds no more than a block of one chunk.
+by body, of a range of gids: memory holds these bodies over the frames that are asked for, about
+twice while rows are sorted, however large the frames are.
 
 Symbols: T frames of a chunk; n bodies of a block.
 """
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -64,6 +66,21 @@ class TrajectoryChunks:
     def bodies(self) -> int:
         """Most bodies of a frame."""
         return int(self.index.count.max())
+
+    def digest(self) -> str:
+        """Tells trajectories apart by their columns and by what they begin with.
+
+        It stays the same while a run appends frames. DataError (65) where the file is damaged.
+        """
+        fields = list(self.fields.values())
+        try:
+            sums = expected_checksums(self._file, fields, range(1))
+        except HDF5_ERRORS as error:
+            raise DataError(f"{self.path}: damaged: {reason(error)}") from None
+        start = [int(self.index.step[0]), float(self.index.time[0]), int(self.index.count[0])]
+        columns = [(field.name, field.dtype, field.width) for field in fields]
+        text = repr((start, columns, sums.tolist()))
+        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
     def blocks(self, number: int) -> list[tuple[int, int]]:
         """Ranges [low, high) of gids, all there are, that hold about as many bodies each."""

@@ -118,6 +118,18 @@ def test_an_archive_that_is_missing_or_damaged_begins_anew_and_says_so(parallel,
         assert opened.steps[0] <= 8
 
 
+@pytest.mark.parametrize("change", ["seed=5", "compress.floor=0.5", "time.step=1e-3"])
+def test_an_archive_of_another_seed_or_other_settings_is_not_gone_on_with(
+    parallel, tmp_path, change
+):
+    simulate(parallel, PILED, tmp_path, steps=8)
+    said = simulate(parallel, PILED, tmp_path, change, resume=True, force=True)
+    (line,) = [line for line in said if "run.tt.h5" in line]
+    name = change.partition("=")[0].rpartition(".")[2]
+    assert "was begun with" in line and name in line
+    assert "kept as run.tt.h5.damaged-1" in line
+
+
 def test_an_archive_that_another_process_writes_is_left_alone(parallel, tmp_path):
     simulate(parallel, PILED, tmp_path, steps=8)
     archive = tmp_path / "run.tt.h5"
