@@ -22,7 +22,8 @@ KINDS: tuple[Kind, ...] = ("relative", "rmse", "pointwise", "exact")
 class Bound:
     """The error that is allowed in a field.
 
-    relative  : ||X - Y||_F <= value ||X||_F, of each block and so of the whole [1]
+    relative  : ||X - Y||_F <= value ||X||_F, of all blocks of a chunk together and so of all
+                chunks; a block of small values may have more of its own norm [1]
     rmse      : ||X - Y||_F <= value sqrt(N) [unit of the field]
     pointwise : max |X - Y| <= value [unit of the field]
     exact     : every bit is kept; value is 0
@@ -46,7 +47,8 @@ class Bound:
         """What a coder has to meet on these values.
 
         `floor` [unit of the field] is the root mean square below which a relative bound no longer
-        shrinks with the values.
+        shrinks with the values. Raises ValueError for a relative bound of values whose norm is not
+        finite.
         """
         if self.kind == "exact":
             return Target(0.0, 0.0)
@@ -55,7 +57,10 @@ class Bound:
         count = math.sqrt(values.size)
         if self.kind == "rmse":
             return Target(frobenius=self.value * count)
-        return Target(frobenius=self.value * max(norm(values), floor * count))
+        size = norm(values)
+        if not math.isfinite(size):
+            raise ValueError(f"relative bound: the norm of the values is {size}")
+        return Target(frobenius=self.value * max(size, floor * count))
 
 
 @dataclass(frozen=True)

@@ -45,11 +45,11 @@ class FieldSpec:
 class Settings:
     """How chunks are coded.
 
-    floor [unit of the field]: relative bounds do not shrink below this times the root mean square
-    of all chunks so far; trial_every: chunks between trials of all coders; step_size [s]: time
+    floor [1]: relative bounds do not shrink below this share of the root mean square of all chunks
+    so far; trial_every: of so many chunks one is a trial of all coders; step_size [s]: time
     between two step numbers, 0 if unknown; effort: "best" or "fast", how much time is spent on
     fewer bytes: fast takes some per cent more, 15 % at most where bounds are 1 % or closer. Raises
-    ValueError for another effort.
+    ValueError for another effort and for trial_every < 1.
     """
 
     floor: float = 0.0
@@ -58,6 +58,8 @@ class Settings:
     effort: str = "best"
 
     def __post_init__(self) -> None:
+        if self.trial_every < 1:
+            raise ValueError(f"trial_every {self.trial_every}: must be positive")
         if self.effort not in EFFORTS:
             raise ValueError(f"effort {self.effort!r}: must be one of {', '.join(EFFORTS)}")
 
@@ -221,7 +223,8 @@ class Encoder:
         that a lossy bound has no meaning for, saying where they are.
         """
         check_block(block, self.fields, len(times))
-        whole = add_scales(self.fields, [self.scales(block)] if scales is None else scales)
+        parts = [self.scales(block)] if scales is None else scales
+        whole = add_scales(self.fields, parts)
         present = presence(block, len(times))
         ends = None if present is None else presence_ends(block, len(times))
         rows = len(times) * len(block.gid) if present is None else int(present.sum())
@@ -233,6 +236,8 @@ class Encoder:
             values = held(block.fields[name], ends)
             if spec.bound.kind != "exact" and values.dtype.kind == "f":
                 _require_finite(name, values, block.gid, present, steps)
+                if spec.bound.kind == "relative":
+                    _require_norm(name, values, [part[name] for part in parts])
             guide = None if spec.guide is None else increments(decoded[spec.guide], times)
             context = coders.Context(guide, order)
             target = self._target(name, values.dtype, rows * spec.width, whole[name])
@@ -249,10 +254,13 @@ class Encoder:
         if bound.kind == "pointwise":
             return Target(maximum=bound.value)
         if bound.kind == "rmse":
-            return Target(frobenius=bound.value * math.sqrt(count))
-        before = self.memory.total.get(name, Scale()) + whole
-        size = max(whole.norm, self.settings.floor * before.rms * math.sqrt(whole.count))
-        return Target(frobenius=bound.value * size * math.sqrt(count / max(whole.count, 1)))
+            allowed = bound.value * math.sqrt(count)
+        else:
+            before = self.memory.total.get(name, Scale()) + whole
+            size = max(whole.norm, self.settings.floor * before.rms * math.sqrt(whole.count))
+            allowed = bound.value * size * math.sqrt(count / max(whole.count, 1))
+        # Where no number says what is allowed, nothing is.
+        return Target(frobenius=allowed) if math.isfinite(allowed) else Target(0.0, 0.0)
 
     def _encode_field(
         self,
@@ -495,6 +503,20 @@ def _require_finite(
         f"{name}: {values[step, row, component]} at step {when}, body {int(gid[row])}, "
         f"component {component}: only an exact bound keeps it: {_kept_by(name)}"
     )
+
+
+def _require_norm(name: str, values: NDArray, parts: Sequence[Scale]) -> None:
+    """Refuse values whose norm, or that of all blocks together, no number holds.
+
+    Where another block is at fault it is for that block to say so: it knows the place.
+    """
+    whole = sum(parts, Scale())
+    others = any(not math.isfinite(part.norm) for part in parts) and math.isfinite(norm(values))
+    if not math.isfinite(whole.norm) and not others:
+        raise InputError(
+            f"{name}: values up to {largest(values):.3g}: their norm, which a relative bound goes "
+            f"by, overflows: {_kept_by(name)}"
+        )
 
 
 def _kept_by(name: str) -> str:

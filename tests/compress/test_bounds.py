@@ -23,6 +23,13 @@ def test_relative_bound_follows_the_norm_down_to_the_floor(values):
     assert bound.target(values).maximum == math.inf
 
 
+@pytest.mark.parametrize("bad", [1.79e308, math.inf, math.nan])
+def test_relative_bound_of_no_finite_norm_is_refused(values, bad):
+    values[:2] = bad
+    with pytest.raises(ValueError, match="relative bound: the norm of the values is"):
+        Bound("relative", 1e-2).target(values)
+
+
 def test_absolute_bounds_do_not_follow_the_norm(values):
     for scale in (1.0, 1e-6):
         assert Bound("rmse", 0.5).target(scale * values).rmse(values.size) == 0.5

@@ -127,6 +127,35 @@ def test_bounds_hold_at_any_scale(scale):
     assert measure(values, decode(part, values)).relative <= 1e-2
 
 
+def test_relative_bounds_are_refused_where_the_norm_overflows():
+    values = np.where(smooth(bodies=8) < 0.0, -1.79e308, 1.79e308)
+    with pytest.raises(InputError, match=r"^x: .* norm, .* overflows: --field x=exact"):
+        encode(encoder_of(Bound("relative", 1e-2)), values)
+    # The norm of a part is finite, that of the chunk is not: no block has a share of it.
+    encoder = encoder_of(Bound("relative", 1e-2))
+    scales = encoder.scales(Block(np.arange(1), {"x": values[:1, :1] / 2.0}))
+    with pytest.raises(InputError, match=r"^x: .* norm, .* overflows"):
+        encode(encoder_of(Bound("relative", 1e-2)), smooth(), 8 * [scales])
+
+
+@pytest.mark.parametrize("norms", [np.nan, np.inf])
+def test_only_the_block_at_fault_is_refused(norms):
+    """It can tell the place; the others lose nothing until it does."""
+    values = smooth(bodies=8)
+    scales = [{"x": Scale(norm(values), values.size)}, {"x": Scale(norms, values.size)}]
+    part = encode(encoder_of(Bound("relative", 1e-2)), values, scales).fields["x"]
+    assert decode(part, values).tobytes() == values.tobytes()
+
+
+@pytest.mark.parametrize("kind", ["rmse", "pointwise"])
+def test_absolute_bounds_hold_where_the_norm_overflows(kind):
+    values = 1e307 * smooth()
+    part = encode(encoder_of(Bound(kind, 1e305)), values).fields["x"]
+    errors = measure(values / 1e307, decode(part, values) / 1e307)
+    assert len(part.data) < values.nbytes / 4
+    assert (errors.rmse if kind == "rmse" else errors.maximum) <= 1e-2 * (1.0 + 1e-12)
+
+
 def test_constants_take_as_many_bytes_as_one_row():
     values = np.full((16, 1000, 3), 9.81)
     assert len(encode(encoder_of(Bound("exact")), values).fields["x"].data) == 24
@@ -282,6 +311,12 @@ def test_errors_of_fast_effort_are_measured_without_decoding(monkeypatch):
         patched.setattr(coders, "decode", None)
         part = encode(encoder, rough[::-1].copy()).fields["x"]
     assert part.errors == measure(rough[::-1], decode(part, rough))
+
+
+@pytest.mark.parametrize("every", [0, -1])
+def test_trials_after_no_chunk_at_all_are_refused(every):
+    with pytest.raises(ValueError, match=f"trial_every {every}: must be positive"):
+        Settings(trial_every=every)
 
 
 def test_unknown_effort_is_refused():
