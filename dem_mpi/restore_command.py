@@ -6,14 +6,14 @@ import contextlib
 import csv
 import sys
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from compress.archive import Archive, Restored
-from compress.bounds import Errors, measure
+from compress.compare import ArchiveValues, Difference, Values, compare
 from dem_mpi import __version__
 from dem_mpi.array_source import ArraySource, is_array
 from dem_mpi.compress_command import refuse_place
@@ -310,97 +310,57 @@ def compare_files(first: Path | str, second: Path | str, fields: Selection) -> l
 
     Each is an archive, a trajectory or an array. Steps and bodies that both have are compared.
     """
-    with _open_values(str(first)) as a, _open_values(str(second)) as b:
-        names = [name for name in a.names if name in b.names]
+    with contextlib.ExitStack() as stack:
+        a, b = (_open_values(str(path), stack) for path in (first, second))
+        pairs = [(name, name) for name in a.names if name in b.names]
         if len(a.names) == len(b.names) == 1:  # arrays, whatever they are called
             pairs = [(a.names[0], b.names[0])]
-        else:
-            if fields.fields is not None:
-                choose("--fields", fields.fields, names, f"both {first} and {second}")
-                names = [name for name in names if name in fields.fields]
-            pairs = [(name, name) for name in names]
-        if not pairs:
-            raise InputError(
-                f"{second}: has no field of {first}: {', '.join(b.names)} and {', '.join(a.names)}"
-            )
-        steps = np.intersect1d(a.steps, b.steps)
-        if not len(steps):
-            raise InputError(f"{second}: has no step of {first}")
-        total = {pair: Errors() for pair in pairs}
-        alone = 0
-        for k in range(0, len(steps), a.chunk):
-            some = steps[k : k + a.chunk]
-            left, right = a.read(some, [x for x, _ in pairs]), b.read(some, [y for _, y in pairs])
-            _, i, j = np.intersect1d(left.gid, right.gid, return_indices=True)
-            both = left.present[:, i] & right.present[:, j]
-            alone += int(left.present.sum() + right.present.sum() - 2 * both.sum())
-            for x, y in pairs:
-                one, other = left.fields[x][:, i][both], right.fields[y][:, j][both]
-                if one.shape != other.shape:
-                    raise InputError(f"{second}: {y} has another width than in {first}")
-                total[x, y] = total[x, y] + measure(one, other)
-    lines = [f"{len(steps):,} steps that both have, {second} against {first}"]
-    lines += [_comparison(x if x == y else f"{x} and {y}", e) for (x, y), e in total.items()]
-    if alone:
-        lines.append(f"note: {alone:,} rows are in one of them only")
+        if fields.fields is not None and pairs:
+            known = dict.fromkeys(name for pair in pairs for name in pair)
+            wanted = choose("--fields", fields.fields, known, f"both {first} and {second}")
+            pairs = [pair for pair in pairs if not {*pair}.isdisjoint(wanted)]
+        found = compare(a, b, pairs)
+    lines = [f"{found.steps:,} steps that both have, {second} against {first}"]
+    lines += [_comparison(x if x == y else f"{x} and {y}", e) for (x, y), e in found.fields.items()]
+    if found.alone:
+        lines.append(f"note: {found.alone:,} rows are in one of them only")
     return lines
 
 
-def _comparison(name: str, errors: Errors) -> str:
-    if errors.frobenius == 0.0:
+def _comparison(name: str, errors: Difference) -> str:
+    if errors.equal:
         return f"  {name}: equal, {errors.count:,} numbers"
+    unlike = f"; {errors.unlike:,} are NaN or infinite in one only" if errors.unlike else ""
+    if not errors.maximum:
+        return f"  {name}: {errors.count:,} numbers are equal{unlike}"
     return (
         f"  {name}: relative {errors.relative:.4e}, rms {errors.rmse:.4e}, of the range "
-        f"{errors.nrmse:.4e}, at most {errors.maximum:.4e}; {errors.count:,} numbers"
+        f"{errors.nrmse:.4e}, at most {errors.maximum:.4e}; {errors.count:,} numbers{unlike}"
     )
 
 
-def _open_values(path: str) -> _ArchiveValues | _TrajectoryValues | _ArrayValues:
+def _open_values(path: str, stack: contextlib.ExitStack) -> Values:
+    """Open what is to be compared, until the stack is left."""
     if is_array(path):
-        return _ArrayValues(path)
+        return stack.enter_context(_ArrayValues(path))
     from dem_mpi.h5files import open_checked
     from dem_mpi.trajectory import FORMAT
 
     with open_checked(path) as file:
         trajectory = read_attributes(file).get("format") == FORMAT
-    return _TrajectoryValues(path) if trajectory else _ArchiveValues(path)
-
-
-class _ArchiveValues:
-    """An archive as `compare_files` reads it."""
-
-    def __init__(self, path: str) -> None:
-        self._archive = Archive(path)
-        self.names = list(self._archive.fields)
-        self.steps = self._archive.steps
-        self.chunk = max((c.stop - c.start for c in self._archive.chunks), default=1)
-
-    def __enter__(self) -> _ArchiveValues:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._archive.close()
-
-    def read(self, steps: NDArray, names: list[str]) -> Restored:
-        """Fields of these steps."""
-        k = np.searchsorted(self.steps, steps)
-        found = self._archive.read(names, slice(int(k[0]), int(k[-1]) + 1))
-        if len(found.steps) == len(steps):
-            return found
-        keep = np.isin(found.steps, steps)
-        fields = {name: values[keep] for name, values in found.fields.items()}
-        return Restored(
-            found.steps[keep], found.times[keep], found.gid, found.present[keep], fields
-        )
+    if trajectory:
+        return stack.enter_context(_TrajectoryValues(path))
+    return ArchiveValues(stack.enter_context(Archive(path)))
 
 
 class _TrajectoryValues:
-    """A trajectory as `compare_files` reads it."""
+    """A trajectory as `compare` reads it."""
 
     chunk = 16
 
     def __init__(self, path: str) -> None:
         self._file = TrajectoryChunks(path)
+        self.path = path
         self.names = [name for name in self._file.fields if name != "gid"]
         self.steps = self._file.index.step
 
@@ -410,7 +370,7 @@ class _TrajectoryValues:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def read(self, steps: NDArray, names: list[str]) -> Restored:
+    def read(self, steps: NDArray, names: Sequence[str]) -> Restored:
         """Fields of these steps."""
         k = np.searchsorted(self.steps, steps)
         frames = range(int(k[0]), int(k[-1]) + 1)
@@ -424,12 +384,13 @@ class _TrajectoryValues:
 
 
 class _ArrayValues:
-    """An array as `compare_files` reads it."""
+    """An array as `compare` reads it."""
 
     chunk = 16
 
     def __init__(self, path: str) -> None:
         self._source = ArraySource(CompressOptions(path))
+        self.path = path
         self.names = list(self._source.specs)
         self.steps = self._source.steps
 
@@ -439,7 +400,7 @@ class _ArrayValues:
     def __exit__(self, *_: object) -> None:
         self._source.close()
 
-    def read(self, steps: NDArray, names: list[str]) -> Restored:
+    def read(self, steps: NDArray, names: Sequence[str]) -> Restored:
         """The array of these steps."""
         frames = range(int(steps[0]), int(steps[-1]) + 1)
         (everything,) = self._source.blocks(1)

@@ -117,3 +117,32 @@ def test_objects_and_broken_files_are_refused(tmp_path):
 def test_arrays_of_different_shape_are_not_compared():
     with pytest.raises(InputError, match="cannot be compared"):
         compare_arrays(np.zeros((2, 3)), np.zeros((3, 2)))
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "maximum"),
+    [
+        (np.array([2**60]), np.array([2**60 + 1]), 1.0),
+        (np.array([-(2**63)]), np.array([2**63 - 1]), 2.0**64),
+        (np.array([2**63], np.uint64), np.array([2**63 + 1], np.uint64), 1.0),
+        (np.array([2**63], np.uint64), np.array([2**63 - 1]), 1.0),
+        (np.array([2**64 - 1], np.uint64), np.array([-(2**63)]), 2.0**64 + 2.0**63),
+        (np.array([-128], np.int8), np.array([127], np.int8), 255.0),
+        (np.array([True, False]), np.array([True, True]), 1.0),
+        (np.array([-1, 7]), np.array([-1, 7]), 0.0),
+    ],
+)
+def test_whole_numbers_are_subtracted_exactly(x, y, maximum):
+    found = compare_arrays(x, y)
+    assert found.maximum == found.frobenius == maximum
+    assert found.equal == (maximum == 0.0)
+
+
+def test_numbers_that_are_not_finite_equal_themselves_only():
+    x = np.array([np.nan, np.inf, -np.inf, 1.0, np.nan, np.inf])
+    y = np.array([np.nan, np.inf, -np.inf, 1.5, 2.0, -np.inf])
+    found = compare_arrays(x, y)
+    assert (found.count, found.unlike, found.maximum) == (4, 2, 0.5)
+    twice = found + found
+    assert (twice.count, twice.unlike, twice.maximum) == (8, 4, 0.5)
+    assert compare_arrays(x, x).equal and not found.equal

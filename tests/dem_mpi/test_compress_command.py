@@ -16,7 +16,7 @@ from dem_mpi.compress_options import ALL, Selection
 from dem_mpi.errors import InputError
 from dem_mpi.output import read_frame
 from dem_mpi.parallel import Parallel
-from dem_mpi.restore_command import restore_file, slice_file
+from dem_mpi.restore_command import compare_files, restore_file, slice_file
 
 from launch import ROOT, run_ranks
 from runs import PILE, messages, simulate
@@ -171,7 +171,7 @@ def test_what_to_expect_is_told_without_writing(folder):
         ("restore a.tt.h5 --fields velocity --output v.h5", 64, "needs position"),
         ("restore run.h5", 65, "run.h5"),
         ("slice a.tt.h5 --output no/where.csv", 64, "there is no directory"),
-        ("compare run.h5 x.npy", 64, "has no field"),
+        ("compare run.h5 x.npy", 64, "no field in common"),
         ("compare run.h5 missing.npy", 64, "no such file"),
     ],
 )
@@ -341,3 +341,57 @@ def test_rows_are_written_chunk_by_chunk(tmp_path):
         (step, gid, 10.0 * step + gid) for step in range(2, 6) for gid in range(2 + (step > 3))
     ]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "a.tt.h5"]
+
+
+# ---- compare -------------------------------------------------------------------------------
+
+
+def compared(tmp_path, first, second, fields=None):
+    """What compare says of two arrays."""
+    np.save(tmp_path / "a.npy", first)
+    np.save(tmp_path / "b.npy", second)
+    return compare_files(tmp_path / "a.npy", tmp_path / "b.npy", Selection(fields=fields))[1]
+
+
+def test_large_whole_numbers_are_compared_exactly(tmp_path):
+    first = np.full((4, 3), 2**60)
+    second = first.copy()
+    assert "equal, 12 numbers" in compared(tmp_path, first, second)
+    second[1, 2] += 1
+    assert "at most 1.0000e+00; 12 numbers" in compared(tmp_path, first, second)
+
+
+def test_nan_equals_nan_and_nothing_else(tmp_path):
+    first = np.arange(12.0).reshape(4, 3)
+    first[0] = np.nan
+    assert "equal, 12 numbers" in compared(tmp_path, first, first)
+    second = first.copy()
+    second[2, 1] = np.nan
+    line = compared(tmp_path, first, second)
+    assert "11 numbers are equal; 1 are NaN or infinite in one only" in line
+    second[3, 0] += 0.5
+    line = compared(tmp_path, first, second)
+    assert "at most 5.0000e-01; 11 numbers; 1 are NaN" in line
+
+
+def test_fields_of_a_comparison_are_checked_also_of_arrays(tmp_path):
+    values = np.zeros((4, 3))
+    assert "equal" in compared(tmp_path, values, values, ("b",))
+    with pytest.raises(InputError, match="--fields zz: no such field"):
+        compared(tmp_path, values, values, ("zz",))
+
+
+def test_what_has_nothing_in_common_is_not_compared(tmp_path):
+    def written(name, first_step, first_gid):
+        steps, gid = np.arange(2) + first_step, np.arange(3) + first_gid
+        with ArchiveWriter(tmp_path / name, {"v": FieldSpec(Bound("exact"))}) as writer:
+            writer.append(Chunk(steps, steps * 0.1, (Block(gid, {"v": np.zeros((2, 3, 1))}),)))
+        return tmp_path / name
+
+    a = written("a.tt.h5", 0, 0)
+    with pytest.raises(InputError, match="no step in common"):
+        compare_files(a, written("b.tt.h5", 2, 0), Selection())
+    with pytest.raises(InputError, match="no body in common in the 2 steps of both"):
+        compare_files(a, written("c.tt.h5", 0, 3), Selection())
+    lines = compare_files(a, written("d.tt.h5", 1, 1), Selection())
+    assert "v: equal, 2 numbers" in lines[1] and "2 rows are in one of them only" in lines[2]
