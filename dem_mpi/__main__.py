@@ -534,7 +534,7 @@ def compress(
         typer.Option(
             "--floor",
             help="A relative bound no longer shrinks with a chunk whose root mean square is below "
-            "this share of that of the chunks before.",
+            "this share of that of the chunks so far, itself included.",
         ),
     ] = 0.0,
     explain: Annotated[

@@ -381,7 +381,16 @@ def explain_lines(parallel: Parallel, source: Source, options: CompressOptions) 
     """Collective. What a sample of the values promises, one fact a line; nothing is written."""
     from compress.explain import explain
 
+    # Coders know where bodies are only where positions are archived with the rest.
+    spec = source.specs.get("position")
+    positions = "position" if spec is not None and spec.width == 3 else None
+
     def work() -> list[str]:
-        return list(explain(source.reader(), source.specs, source.times, chunk=options.chunk).lines)
+        read, times = source.reader(), source.times
+        try:
+            found = explain(read, source.specs, times, chunk=options.chunk, positions=positions)
+        except ValueError as error:
+            raise InputError(f"{options.source}: {error}") from None
+        return list(found.lines)
 
     return _on_root(parallel, work)

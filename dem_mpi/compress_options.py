@@ -43,6 +43,7 @@ class CompressOptions:
         """Check what one value alone, or two together, can violate. InputError names the flag."""
         if not (math.isfinite(self.tolerance) and self.tolerance > 0.0):
             raise InputError(f"--tol {self.tolerance:g}: must be > 0 and finite, such as 1e-2")
+        _refuse_no_values(f"--tol {self.tolerance:g}", "relative", self.tolerance)
         if not 1 <= self.chunk <= _LARGEST_CHUNK:
             raise InputError(f"--chunk {self.chunk}: must be between 1 and {_LARGEST_CHUNK}")
         if not (math.isfinite(self.floor) and 0.0 <= self.floor <= 1.0):
@@ -99,7 +100,13 @@ def _bound(flag: str, text: str) -> tuple[str, float]:
         value = math.nan
     if not (math.isfinite(value) and value > 0.0):
         raise InputError(f"--field {flag}: the bound must be > 0 and finite, such as 1e-2")
+    _refuse_no_values(f"--field {flag}", kind, value)
     return kind, value
+
+
+def _refuse_no_values(flag: str, kind: str, value: float) -> None:
+    if kind == "relative" and value >= 1.0:
+        raise InputError(f"{flag}: must be < 1: zeros for all values err by no more")
 
 
 def parse_selection(fields: str | None, steps: str | None, bodies: str | None) -> Selection:

@@ -102,12 +102,19 @@ class ArchiveFacts:
         """How many times smaller the file is than the values."""
         return self.raw / self.coded if self.coded else 0.0
 
+    @property
+    def comparison(self) -> str:
+        """The file beside the values, in words."""
+        if self.ratio >= 1.0:
+            return f"{self.ratio:.3g} times smaller"
+        return f"{self.coded / self.raw:.3g} times larger" if self.raw else "larger"
+
     def lines(self) -> list[str]:
         """What to tell of it, one fact a line."""
         chunks = f"{self.chunks:,} chunk{'s' * (self.chunks != 1)}"
         lines = [
             f"{self.frames:,} frames in {chunks} in {self.path}: {readable_size(self.coded)} for "
-            f"{readable_size(self.raw)}, {self.ratio:.3g} times smaller"
+            f"{readable_size(self.raw)}, {self.comparison}"
         ]
         return lines + [f"  {line}" for line in self.field_lines()]
 

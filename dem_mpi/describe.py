@@ -283,7 +283,7 @@ def _describe_archive(path: Path, found: Description, verify: bool) -> Descripti
         notes.append(f"floor {settings.floor:g}")
     if facts.raw:
         size = f"{readable_size(facts.coded)} for {readable_size(facts.raw)}"
-        notes += [f"{size}, {facts.ratio:.3g} times smaller", facts.coder_line()]
+        notes += [f"{size}, {facts.comparison}", facts.coder_line()]
     return replace(
         found,
         valid=True,
