@@ -69,6 +69,7 @@ DEFAULT_SETTINGS = Settings()
 JUMP = 1.5
 SAMPLE = 1024
 RUNS = 16  # of consecutive bodies, that a sample consists of
+TELLING = 256  # bytes of a sample, below which they are heads and chance
 
 
 @dataclass(frozen=True)
@@ -329,7 +330,7 @@ class _Task:
         codes = {n: coders.encode(n, sample, share, known, self.effort) for n in sized}
         # What needs more than the values is as good as what does not.
         sizes = {n: sample.nbytes if code is None else len(code) for n, code in codes.items()}
-        most = self.effort.promising * min(sizes.values())
+        most = max(self.effort.promising * min(sizes.values()), TELLING)
         return tuple(n for n in names if sizes.get(n, 0) <= most)
 
     def smallest(self, names: Sequence[str]) -> tuple[CodedField, NDArray] | None:
