@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations
 from typing import Literal
 
 import numpy as np
@@ -26,9 +25,6 @@ THESIS_ORDER: tuple[Axis, Axis, Axis] = ("bodies", "steps", "components")
 
 Form = Literal["matrix", "natural", "tensorised"]
 
-# A trial of orders looks at so many bodies, in so many runs of neighbours.
-_TRIAL_BODIES = 512
-_TRIAL_RUNS = 4
 # Squaring loses half of the digits: below this the singular values themselves are needed.
 _GRAM_FLOOR = 1e-6
 
@@ -252,26 +248,6 @@ def train_parameters(shape: Sequence[int], ranks: Sequence[int]) -> int:
     """sum_k r_{k-1} n_k r_k of a tensor train with d - 1 inner ranks."""
     whole = (1, *ranks, 1)
     return sum(r * n * s for r, n, s in zip(whole, shape, whole[1:], strict=False))
-
-
-def choose(
-    values: NDArray, tolerance: float, form: Form = "tensorised", largest: int = 5
-) -> Tensorisation:
-    """The tensorisation of an array (T, n, w), bodies in Morton order, that looks cheapest.
-
-    Every order of the axes is tried on a few runs of neighbouring bodies: the one whose unfoldings
-    promise the fewest parameters at the relative tolerance wins, the thesis' order if none is
-    better. `values` must be finite.
-    """
-    sample = sample_bodies(values, _TRIAL_BODIES, _TRIAL_RUNS)
-
-    def parameters(order: tuple[Axis, Axis, Axis]) -> tuple[int, bool]:
-        trial = Tensorisation.of(sample.shape, form, order, largest)
-        ranks = unfolding_ranks(trial.forward(sample), tolerance)
-        return train_parameters(trial.shape, ranks), order != THESIS_ORDER
-
-    order = min(permutations(AXES), key=parameters)
-    return Tensorisation.of(values.shape, form, order, largest)
 
 
 def sample_bodies(values: NDArray, count: int, runs: int) -> NDArray:

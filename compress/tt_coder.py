@@ -178,10 +178,11 @@ def _encode_tensorised(values: NDArray, target: Target, order: NDArray | None) -
     if frobenius >= norm(values):
         # A few entries stand out, which a train of zeros would lose.
         frobenius = 0.5 * norm(values)
+    frobenius = min(frobenius, sys.float_info.max)
+    axes = tt_tensorised.choose_axes(values, order, Target(frobenius))
     best = None
     for _ in range(TRIALS):
-        frobenius = min(frobenius, sys.float_info.max)
-        code = tt_tensorised.encode(values, order, Target(frobenius))
+        code = tt_tensorised.encode(values, order, Target(frobenius), axes)
         if code is None or len(code) >= values.nbytes:
             break
         errors = measure(values, decode(head + code, order))
@@ -191,6 +192,7 @@ def _encode_tensorised(values: NDArray, target: Target, order: NDArray | None) -
         if CLOSE <= excess <= 1.0:
             break
         frobenius *= min(max(SEEK / max(excess, 1e-30), 0.2), 2.0)
+        frobenius = min(frobenius, sys.float_info.max)
     return None if best is None else head + best
 
 

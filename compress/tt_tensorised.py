@@ -6,6 +6,10 @@ right of it; in core k > p, for that to the left. Cores times their sigma are th
 with one step for all of them, in units of which the errors add up as those of independent numbers
 do. The decoder has the sigmas in quarters of a power of two, since they only choose steps.
 
+Either bodies come first or time does; a sample is coded both ways. Of 16,384 settling spheres (32
+steps of velocities, relative error 0.1), rows as they were placed, layer by layer, time first takes
+14 % fewer bytes, during the impact 32 % fewer; with rows in Morton order it takes more.
+
 Symbols: n bodies in Morton order, T steps of time, w components, d dimensions, r ranks.
 """
 
@@ -20,17 +24,20 @@ from numpy.typing import NDArray
 from compress import _kernels_train as kernels
 from compress._bytes import Bytes, number, signed
 from compress._kernels_basis import polynomials
-from compress.bounds import Target
+from compress.bounds import Target, norm
 from compress.decompose import tt_svd
 from compress.entropy import decode_integers, encode_integers
 from compress.quantise import PRICE, Rounded, round_matrix, shift_values, unround
 from compress.step_search import MET, Seeker, step_size
-from compress.tensorize import Tensorisation
+from compress.tensorize import THESIS_ORDER, Axis, Tensorisation, sample_bodies
 
 TRUNCATION = 0.6  # share of the error that truncation may take, the rest is rounding's
 PASSES = 6
 DROPPED = 0.6  # a column below so many steps would be rounded to nothing
 QUARTERS = (1.0, 1.189207115002721, 1.4142135623730951, 1.681792830507429)
+# In codes an order of the axes is its place in this list. Bodies are first or last.
+ORDERS: tuple[tuple[Axis, Axis, Axis], ...] = (THESIS_ORDER, ("steps", "components", "bodies"))
+TRIAL_BODIES, TRIAL_RUNS = 2048, 4  # that a trial of orders codes, and runs of neighbours
 MOST_PARAMETERS = 2.0  # to the entries: a number of a core costs some bits, not 64
 
 
@@ -51,8 +58,9 @@ class _Code:
     cores: list[_Core]
     error: float
 
-    def pack(self, exponent: int) -> bytes:
-        data = signed(exponent) + self.step.to_bytes(2, "little") + number(self.pivot)
+    def pack(self, axes: int, exponent: int) -> bytes:
+        data = bytes([axes]) + signed(exponent)
+        data += self.step.to_bytes(2, "little") + number(self.pivot)
         for core in self.cores:
             data += number(core.rounded.q.shape[1])
         bonds = [core.exponents for k, core in enumerate(self.cores) if k != self.pivot]
@@ -64,15 +72,35 @@ class _Code:
         return data
 
 
-def encode(values: NDArray, order: NDArray | None, target: Target) -> bytes | None:
+def choose_axes(values: NDArray, order: NDArray | None, target: Target) -> int:
+    """Which of ORDERS takes the fewest bytes on a sample of bodies, sorted by `order`.
+
+    The first where all are alike, as where zeros would do for the sample.
+    """
+    bodies = values if order is None else values[:, order]
+    sample = sample_bodies(bodies, TRIAL_BODIES, TRIAL_RUNS)
+    goal = Target(target.frobenius * math.sqrt(sample.size / values.size))
+    if norm(sample) <= goal.frobenius:
+        return 0
+
+    def length(axes: int) -> float:
+        code = encode(sample, None, goal, axes)
+        return math.inf if code is None else len(code)
+
+    return min(range(len(ORDERS)), key=length)
+
+
+def encode(values: NDArray, order: NDArray | None, target: Target, axes: int = 0) -> bytes | None:
     """Code (T, n, w) finite values, bodies sorted by `order`; None if that does not pay.
+
+    axes : which of ORDERS the dimensions follow
 
     The Frobenius error is met by the sum of the cores' errors, measured afterwards by the caller;
     a pointwise target has to be met by a smaller Frobenius error.
     """
     exponent = math.frexp(float(np.abs(values).max()))[1]
     X = np.ldexp(np.asarray(values, np.float64), -exponent)
-    layout = Tensorisation.of(X.shape)
+    layout = Tensorisation.of(X.shape, order=ORDERS[axes])
     if layout.ndim < 2:
         return None
     tensor = layout.forward(X if order is None else X[:, order])
@@ -84,7 +112,7 @@ def encode(values: NDArray, order: NDArray | None, target: Target) -> bytes | No
     rest = math.sqrt(max(goal**2 - found.truncation**2, 0.0) * tensor.size / X.size)
     train = _Train(found.train.cores, found.pivot)
     code = train.search(rest)
-    return None if code is None else code.pack(exponent)
+    return None if code is None else code.pack(axes, exponent)
 
 
 def decode(
@@ -96,21 +124,31 @@ def decode(
 ) -> NDArray[np.float64]:
     """Values (T', n', w) of the steps and bodies with these indices, of a block (T, n, w)."""
     _, n, width = shape
-    layout = Tensorisation.of(shape)
+    axes = source.take(1)[0]
+    if axes >= len(ORDERS):
+        raise ValueError(f"coded block: of no known order of axes ({axes})")
+    layout = Tensorisation.of(shape, order=ORDERS[axes])
     exponent = source.signed(1100)
     cores = _read_cores(source, layout.shape)
     if order is not None:
         place = np.empty(n, np.int64)
         place[order] = np.arange(n)
         bodies = place[bodies]
-    split = layout.dimensions("bodies").stop
-    left = _expand(cores[:split], layout.digits("bodies", bodies))
+    zero = np.zeros(len(bodies), np.int64)
+    # Levels of bodies stand on one side of the train, time and components on the other.
+    split = layout.dimensions("bodies")
+    first = split.start == 0
+    cut = split.stop if first else split.start
+    entries = layout.locate(zero, bodies, zero)
     component = np.tile(np.arange(width), len(steps))
     step = np.repeat(steps, width)
-    digits = layout.locate(step, np.zeros_like(step), component)[:, split:]
-    mirrored = [np.ascontiguousarray(core.transpose(2, 1, 0)) for core in cores[split:][::-1]]
-    right = _expand(mirrored, digits[:, ::-1])
-    y = kernels.multiply(left, np.ascontiguousarray(right.T))
+    times = layout.locate(step, np.zeros_like(step), component)
+    left, right = (entries, times) if first else (times, entries)
+    mirrored = [np.ascontiguousarray(core.transpose(2, 1, 0)) for core in cores[cut:][::-1]]
+    left = _expand(cores[:cut], left[:, :cut])
+    right = _expand(mirrored, right[:, cut:][:, ::-1])
+    rows, columns = (left, right) if first else (right, left)
+    y = kernels.multiply(rows, np.ascontiguousarray(columns.T))
     y = y.reshape(len(bodies), len(steps), width).transpose(1, 0, 2)
     with np.errstate(over="ignore", under="ignore"):
         return np.ldexp(np.ascontiguousarray(y), exponent)

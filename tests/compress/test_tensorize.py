@@ -10,9 +10,7 @@ import pytest
 
 from compress.tensorize import (
     AXES,
-    THESIS_ORDER,
     Tensorisation,
-    choose,
     levels,
     morton_order,
     train_parameters,
@@ -183,33 +181,3 @@ def test_unfolding_ranks_of_nothing_and_of_noise():
 def test_parameters_of_a_train():
     # S. De, PhD thesis, University of Michigan 2021, eq. 4.30
     assert train_parameters((4, 5, 6), (2, 3)) == 1 * 4 * 2 + 2 * 5 * 3 + 3 * 6 * 1
-
-
-def test_choice_is_the_cheapest_order_on_the_whole_array():
-    # Each component is a wave of its own in time, the same for all bodies: where components come
-    # between, both sides would have to know them.
-    steps = np.arange(32)
-    wave = np.stack([np.cos(k * steps / 5.0) for k in (1.0, 1.7, 2.9)], axis=1)
-    field = wave[:, None, :] * random_field((1, 256, 1))
-    chosen = choose(field, 1e-3)
-    cost = {}
-    for order in ORDERS:
-        split = Tensorisation.of(field.shape, order=order)
-        cost[order] = train_parameters(split.shape, unfolding_ranks(split.forward(field), 1e-3))
-    assert cost[chosen.order] == min(cost.values())
-    assert min(cost.values()) < 0.9 * max(cost.values())
-
-
-def test_choice_keeps_the_usual_order_where_none_is_better():
-    assert choose(np.ones((4, 600, 3)), 1e-2).order == THESIS_ORDER
-    assert choose(np.zeros((4, 6, 3)), 1e-2).order == THESIS_ORDER
-
-
-def test_choice_costs_no_more_for_many_bodies(monkeypatch):
-    seen = []
-    monkeypatch.setattr(
-        "compress.tensorize.unfolding_ranks",
-        lambda tensor, tolerance: seen.append(tensor.size) or (1,) * (tensor.ndim - 1),
-    )
-    assert choose(np.zeros((8, 5000, 3)), 1e-2, form="natural").lengths == (8, 5000, 3)
-    assert max(seen) <= 8 * 512 * 3
