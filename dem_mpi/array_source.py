@@ -15,13 +15,22 @@ from compress.bounds import Bound
 from compress.sources import HDF5_SUFFIXES, open_array
 from dem_mpi.compress_options import CompressOptions, choose
 from dem_mpi.errors import InputError
-from dem_mpi.h5files import readable_size
+from dem_mpi.h5files import open_checked, readable_size
 
 
 def is_array(source: str) -> bool:
     """Whether a source is an array rather than a trajectory, by its name alone."""
     file, colon, _ = source.rpartition(":")
     return source.endswith(".npy") or (bool(colon) and file.endswith(HDF5_SUFFIXES))
+
+
+def require_data_set(source: str) -> None:
+    """Raise InputError, with the data sets there are, for a file of arrays without one's name."""
+    if source.endswith(HDF5_SUFFIXES):
+        with open_checked(source) as file:
+            known = "format" in file.attrs
+        if not known:
+            open_array(source).close()
 
 
 class ArraySource:

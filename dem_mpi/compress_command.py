@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from compress.archive import Archive, Block, FieldSpec, Settings
 from compress.bounds import Bound
 from dem_mpi import __version__
-from dem_mpi.array_source import ArraySource, is_array
+from dem_mpi.array_source import ArraySource, is_array, require_data_set
 from dem_mpi.compress_options import CompressOptions, choose
 from dem_mpi.compression import (
     ArchiveFacts,
@@ -106,6 +106,7 @@ def open_source(options: CompressOptions) -> Source:
     """What is to be compressed. InputError (64) or DataError (65) where it cannot be."""
     if is_array(options.source):
         return ArraySource(options)
+    require_data_set(options.source)
     return TrajectorySource(options)
 
 

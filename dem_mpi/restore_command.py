@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from compress.archive import Archive, Restored
 from compress.compare import ArchiveValues, Difference, Values, compare
 from dem_mpi import __version__
-from dem_mpi.array_source import ArraySource, is_array
+from dem_mpi.array_source import ArraySource, is_array, require_data_set
 from dem_mpi.compress_command import refuse_place
 from dem_mpi.compress_options import ALL, CompressOptions, Range, Selection, choose, range_text
 from dem_mpi.errors import DataError, InputError
@@ -343,6 +343,7 @@ def _open_values(path: str, stack: contextlib.ExitStack) -> Values:
     """Open what is to be compared, until the stack is left."""
     if is_array(path):
         return stack.enter_context(_ArrayValues(path))
+    require_data_set(path)
     from dem_mpi.h5files import open_checked
     from dem_mpi.trajectory import FORMAT
 

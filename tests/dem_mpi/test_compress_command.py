@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 
+import h5py
 import numpy as np
 import pytest
 
@@ -32,6 +33,8 @@ def folder(tmp_path_factory):
     done = verb(path, "compress", "run.h5", "--output", "a.tt.h5", "--chunk", "8", "--tol", "1e-3")
     assert done.returncode == 0, done.stderr
     t = np.arange(50.0)[:, None, None]
+    with h5py.File(path / "d.nc", "w") as file:
+        file["g/x"] = np.zeros((4, 3))
     np.save(path / "x.npy", np.sin(0.1 * t + np.arange(40.0)[:, None] + np.arange(3.0)))
     return path
 
@@ -147,6 +150,8 @@ def test_what_to_expect_is_told_without_writing(folder):
     [
         ("compress missing.h5", 64, "no such file"),
         ("compress a.tt.h5", 65, "not a trajectory"),
+        ("compress d.nc", 64, "name a data set in it, d.nc:/path; it has /g/x"),
+        ("compare x.npy d.nc", 64, "name a data set in it, d.nc:/path; it has /g/x"),
         ("compress run.h5 --tol -1", 64, "--tol -1: must be > 0"),
         ("compress run.h5 --tol nan", 64, "--tol nan: must be > 0"),
         ("compress run.h5 --chunk 0", 64, "--chunk 0: must be between"),
