@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from compress import tt_natural, tt_tensorised
 from compress._bytes import Bytes, number
-from compress.bounds import Target, measure, norm
+from compress.bounds import Errors, Target, measure, norm
 from compress.effort import BEST, Effort
 from compress.step_search import CLOSE, SEEK
 
@@ -186,7 +186,7 @@ def _encode_tensorised(values: NDArray, target: Target, order: NDArray | None) -
         if code is None or len(code) >= values.nbytes:
             break
         errors = measure(values, decode(head + code, order))
-        excess = max(errors.frobenius / target.frobenius, errors.maximum / target.maximum)
+        excess = _excess(errors, target)
         if excess <= 1.0 and (best is None or len(code) < len(best)):
             best = code
         if CLOSE <= excess <= 1.0:
@@ -194,6 +194,12 @@ def _encode_tensorised(values: NDArray, target: Target, order: NDArray | None) -
         frobenius *= min(max(SEEK / max(excess, 1e-30), 0.2), 2.0)
         frobenius = min(frobenius, sys.float_info.max)
     return None if best is None else head + best
+
+
+def _excess(errors: Errors, target: Target) -> float:
+    """The largest share of what the target allows; errors may have overflowed."""
+    pairs = ((errors.frobenius, target.frobenius), (errors.maximum, target.maximum))
+    return max((error / allowed for error, allowed in pairs if allowed < math.inf), default=0.0)
 
 
 def _is_plain(values: NDArray) -> bool:

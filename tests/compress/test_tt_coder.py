@@ -296,9 +296,10 @@ def test_hard_cases_keep_to_the_bound(values, form):
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("tolerance", [0.9, 1e-4])
 def test_values_whose_norm_overflows_keep_to_the_pointwise_bound(form, tolerance):
-    values = np.full((5, 20, 2), 1.7e308)
-    target = Target(maximum=tolerance * 1.7e308)
-    assert target.met_by(measure(values, decode(encode(values, target, form=form))))
+    for profile in (np.ones(20), np.linspace(-1.0, 1.0, 20)):
+        values = 1.7e308 * np.ones((5, 20, 2)) * profile[:, None]
+        target = Target(maximum=tolerance * 1.7e308)
+        assert target.met_by(measure(values, decode(encode(values, target, form=form))))
 
 
 def test_empty_blocks_stay_empty():
