@@ -219,13 +219,13 @@ class ChunkWriter:
     def append(self, steps: Sequence[int], times: Sequence[float], blocks: Sequence[Block]) -> None:
         """Code this rank's blocks of a chunk, and append those of all ranks."""
         parallel = self._parallel
-        instants = np.array(times, dtype=np.float64)
+        numbers, instants = np.array(steps, dtype=np.int64), np.array(times, dtype=np.float64)
         pairs = list(zip(self._encoders, blocks, strict=True))
         parts = parallel.gather([encoder.scales(block) for encoder, block in pairs])
         scales = [one for part in parallel.broadcast(parts) for one in part]
         coded, error = [], None
         try:
-            coded = [encoder.encode(block, instants, scales) for encoder, block in pairs]
+            coded = [encoder.encode(block, instants, scales, numbers) for encoder, block in pairs]
         except DemError as caught:
             error = caught
         parallel.raise_together(error)
@@ -233,9 +233,7 @@ class ChunkWriter:
         with agree(parallel, self.path, "write"):
             if self._writer is not None:
                 everyone = tuple(block for part in gathered for block in part)
-                self._writer.append_coded(
-                    CodedChunk(np.array(steps, dtype=np.int64), instants, everyone)
-                )
+                self._writer.append_coded(CodedChunk(numbers, instants, everyone))
 
     def close(self) -> None:
         """Mark the archive as complete; a second call does nothing."""
